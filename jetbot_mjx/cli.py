@@ -20,17 +20,8 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NoReturn, TypeVar
 
-from jetbot_mjx import startup
-from jetbot_mjx.errors import (
-    READER_LEFT,
-    NotFoundError,
-    UserError,
-    os_errors,
-    printable,
-    printable_lines,
-    ran_out,
-    write_error,
-)
+from jetbot_mjx import errors, startup
+from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import parse_goals
 from jetbot_mjx.interrupts import INTERRUPTED
 
@@ -98,7 +89,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit with code 2."""
-        message = printable(" ".join(message.splitlines()))
+        message = errors.printable(" ".join(message.splitlines()))
         self.exit(USER_ERROR, f"{self.prog}: error: {message} (--help lists the arguments)\n")
 
 
@@ -194,7 +185,7 @@ def tell(text: str) -> None:
     Args:
       text: one line or several.
     """
-    print(printable_lines(text), flush=True)
+    print(errors.printable_lines(text), flush=True)
 
 
 def _report_error(error: BaseException) -> int | None:
@@ -209,7 +200,7 @@ def _report_error(error: BaseException) -> int | None:
             print(f"error: {error}", file=sys.stderr)
             return USER_ERROR
         # JAX raises a subclass, which is not named here because that would import JAX.
-        case RuntimeError() if ran_out(error):
+        case RuntimeError() if errors.ran_out(error):
             print(
                 "error: the device's memory is too small: choose a smaller --episodes",
                 file=sys.stderr,
@@ -228,8 +219,8 @@ def _report_lost_output(code: int, *, writes_files: bool) -> int:
     A reader that leaves, such as `head`, has read what it wanted.
     """
     sys.stdout.flush()
-    error = write_error(sys.stdout)
-    if error is None or error.errno in READER_LEFT:
+    error = errors.write_error(sys.stdout)
+    if error is None or error.errno in errors.READER_LEFT:
         return code
     failed = not (code or writes_files)
     kind = "error" if failed else "warning"
@@ -397,10 +388,10 @@ def find_policy(name: str) -> Path:
         from jetbot_mjx.runs import explain_missing, find_run
     path = find_run(name)
     what = f"no checkpoint at {path.absolute()}"
-    with os_errors(what):
+    with errors.os_errors(what):
         reason = explain_missing(path.absolute())
     if reason:
-        raise NotFoundError(f"{what}: {reason}")
+        raise errors.NotFoundError(f"{what}: {reason}")
     return path
 
 
