@@ -34,6 +34,9 @@ PROGRAM = "jetbot-mjx"
 USER_ERROR = 2
 _BUG = 1
 
+_BY_POSITION = "config_by_position"
+"""Attribute of the parsed arguments with the `CONFIG` that no `--config` precedes."""
+
 
 class Parser(argparse.ArgumentParser):
     """An argument parser that reports an error in one line, with a likely remedy."""
@@ -55,6 +58,8 @@ class Parser(argparse.ArgumentParser):
                 self.error(f"unrecognized arguments: {name}{self._remedy(word, name)}")
         parsed, extra = self.parse_known_args(words, namespace)
         assert parsed is not None
+        if by_position := getattr(parsed, _BY_POSITION, None):
+            parsed.config = by_position
         if extra:
             remedy = self._remedy(extra[0])
             half = [one for one in getattr(parsed, "overrides", []) if "=" not in one]
@@ -426,21 +431,6 @@ def add_checkpoint_arguments(
     )
 
 
-class _KeepIfAbsent(argparse.Action):
-    """An action of a positional argument that may be absent: another one may have set its value."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: object,
-        option_string: str | None = None,
-    ) -> None:
-        """Store the value if there is one."""
-        if values is not None:
-            setattr(namespace, self.dest, values)
-
-
 def add_config_arguments(
     parser: argparse.ArgumentParser,
     group: "argparse._MutuallyExclusiveGroup | None" = None,
@@ -459,9 +449,7 @@ def add_config_arguments(
     same = "the configuration, in place of CONFIG"
     group.add_argument("--config", type=Path, metavar="CONFIG", help=same if positional else text)
     if positional:
-        group.add_argument(
-            "config", type=Path, nargs="?", action=_KeepIfAbsent, metavar="CONFIG", help=text
-        )
+        group.add_argument(_BY_POSITION, type=Path, nargs="?", metavar="CONFIG", help=text)
     parser.add_argument(
         "--set",
         dest="overrides",
