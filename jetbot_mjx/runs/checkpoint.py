@@ -14,7 +14,7 @@ from jetbot_mjx import agents
 from jetbot_mjx.agents import Networks, Policy, PolicyParams
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.devices import require_float32
-from jetbot_mjx.envs import FieldData, JetBotEnv, layout_data
+from jetbot_mjx.envs import JetBotEnv, LayoutData, layout_data
 from jetbot_mjx.errors import InvalidError, UserError, os_errors, shown
 from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint_store import FOLDER, CheckpointError, CheckpointNotFoundError
@@ -32,9 +32,6 @@ POLICY = "policy"
 
 FORMAT = "jetbot_mjx/3"
 """Format of a checkpoint's content; checkpoints of other formats cannot be read."""
-
-LayoutData = Sequence[FieldData]
-"""The fields of an observation, as checkpoints store them."""
 
 _Size = Annotated[int, Field(ge=1, lt=2**24)]
 

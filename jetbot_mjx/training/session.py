@@ -270,7 +270,7 @@ def _train(training: Training, stop: StopRequest) -> Result:
         clock = stack.enter_context(CompileClock())
         # Several processes end together, after the first checkpoint.
         if jax.process_count() == 1:
-            stop.begin_compiling(say_stopped)
+            stop.compiling = say_stopped
         stack.enter_context(stop)
         seeds = [one.seed for one in config.of_each_seed()]
         trainer = ppo_trainer.CompiledTrainer(training.ppo, seeds, training.setup.programs)
