@@ -12,6 +12,7 @@ reason this module imports them only where it uses them.
 import argparse
 import contextlib
 import difflib
+import functools
 import os
 import shlex
 import sys
@@ -286,6 +287,8 @@ def number(kind: type[_Number], least: float, most: float = _LARGEST) -> Callabl
     return parse
 
 
+whole_number = functools.partial(number, int)
+positive_int = whole_number(1)
 fraction = number(float, 0, 1)
 
 
@@ -309,7 +312,7 @@ def add_count(
       default: the value where the option is absent; None: the help says what that means.
     """
     shown = "" if default is None else f" (default: {default:,})"
-    kind = number(int, least, most)
+    kind = whole_number(least, most)
     parser.add_argument(name, type=kind, default=default, metavar="N", help=text + shown)
 
 

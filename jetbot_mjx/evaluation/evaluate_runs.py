@@ -24,7 +24,7 @@ from jetbot_mjx.evaluation.report import (
 )
 from jetbot_mjx.evaluation.result_names import find_report, name_with_count, report_folder
 from jetbot_mjx.evaluation.robustness import SWEEP_GOALS, MujocoEvaluator, MujocoResult, Sweeper
-from jetbot_mjx.runs import Checkpoint, JsonObject, Setup, Which, load_checkpoint, shortened
+from jetbot_mjx.runs import Checkpoint, JsonObject, Setup, Which, check_writable, load_checkpoint
 from jetbot_mjx.terminal import stage
 
 Simulator = Literal["mujoco"]
@@ -69,7 +69,7 @@ def evaluate_run(run_or_checkpoint: str | Path, **options: Unpack[ReportOptions]
     """
     reporter = _Reporter(**options)
     checkpoint = load_checkpoint(run_or_checkpoint, reporter.which)
-    runs.check_writable(Path(reporter.output or checkpoint.results_dir / _FOLDER))
+    check_writable(Path(reporter.output or checkpoint.results_dir / _FOLDER))
     return reporter.write(checkpoint, checkpoint.make_setup(), reporter.output)
 
 
@@ -105,13 +105,13 @@ def evaluate_in_mujoco(
     return evaluator.run(checkpoint.params, report_keys(episodes))
 
 
-def compare_runs(paths: Sequence[str | Path], **options: Unpack[ReportOptions]) -> Comparison:
+def compare_runs(runs: Sequence[str | Path], **options: Unpack[ReportOptions]) -> Comparison:
     """Evaluate the policies of several runs or seeds, write a report on each, and compare them.
 
     The report on a policy is not written again if there is one that is at least as full.
 
     Args:
-      paths: Run folders, of one seed or several, or checkpoint folders.
+      runs: Run folders, of one seed or several, or checkpoint folders.
       **options: What to evaluate, and where to write the comparison.
 
     Returns:
@@ -123,7 +123,7 @@ def compare_runs(paths: Sequence[str | Path], **options: Unpack[ReportOptions]) 
     """
     reporter = _Reporter(**options)
     # Load all policies and check that they can be compared.
-    entries = _load_runs([Path(path) for path in paths], reporter.which)
+    entries = _load_runs([Path(path) for path in runs], reporter.which)
     check_comparable({name: entry.first.config for name, entry in entries.items()})
     first = next(iter(entries.values())).folder
     name = name_with_count("comparison", reporter.episodes, REPORT_GOALS, "-goals")
@@ -135,7 +135,7 @@ def compare_runs(paths: Sequence[str | Path], **options: Unpack[ReportOptions]) 
         for seed, checkpoint in entry.seeds.items()
     ]
     for path in (folder, *(checkpoint.results_dir / _FOLDER for _, _, checkpoint, _ in policies)):
-        runs.check_writable(path)
+        check_writable(path)
     # Evaluate each policy and write its report.
     by_run: dict[str, dict[str, Report]] = {name: {} for name in entries}
     with stage("policies", len(policies)) as advance:
@@ -187,8 +187,8 @@ def _load_runs(paths: Sequence[Path], which: Which) -> dict[str, RunEntry]:
             place = checkpoint.path.resolve()
             if place in owners:
                 raise UserError(
-                    f"{path} and {owners[place]} are the same policy, {shortened(checkpoint.path)}:"
-                    " name each once"
+                    f"{path} and {owners[place]} are the same policy,"
+                    f" {runs.shortened(checkpoint.path)}: name each once"
                 )
             owners[place] = path
         first = next(iter(seeds.values()))
@@ -319,7 +319,7 @@ class _Reporter:
         self._build(checkpoint, setup, ranges)
         finished = jax.device_get(self._nominal.run(checkpoint.params, self._keys))
         best_known, missing = compare_with_best_known(config, finished)
-        run_dir = shortened(checkpoint.run_dir)
+        run_dir = runs.shortened(checkpoint.run_dir)
         history = runs.read_history(checkpoint.run_dir / runs.METRICS)
         report = Report(
             folder=Path(output or fuller or report_folder(*wanted)),
