@@ -88,10 +88,7 @@ def read_log(path: Path) -> DriveLog:
     pictures: list[LoggedPicture | None] = []
     outcome, stale_ticks, number = "interrupted", 0, 1
     try:
-        header = json.loads(lines[0])
-        calibration, goal_w = _parse_calibration(header), _parse_goal(header)
-        if "image" in header:
-            camera_config(header["image"])
+        header, calibration, goal_w = _parse_header(lines[0])
         for number, text in enumerate(lines[1:], start=2):
             if number == len(lines) and not text.endswith("}"):
                 break  # The drive ended while this line was written.
@@ -131,6 +128,15 @@ def read_log(path: Path) -> DriveLog:
         stale_ticks=stale_ticks,
         pictures=tuple(picture for picture in pictures if picture is not None),
     )
+
+
+def _parse_header(text: str) -> tuple[JsonObject, MotorModel, tuple[float, float] | None]:
+    """Return the header, its calibration and its goal, and check its camera."""
+    header = json.loads(text)
+    calibration, goal_w = _parse_calibration(header), _parse_goal(header)
+    if "image" in header:
+        camera_config(header["image"])
+    return header, calibration, goal_w
 
 
 def _parse_pose(period: JsonObject) -> tuple[float, tuple[float, ...]]:

@@ -172,11 +172,10 @@ def _programs(
       task_class: as for `MujocoJetBot`.
 
     Returns:
-      The environment and its model; the program of a reset, from a key to (first pose, goal,
-      positions of solid bodies, numbers of the observation, its images, next key); and that of the
-      task's part of a step, from (poses and action, goal, images before) to (numbers and scalars of
-      the step, images, goal, positions of solid bodies), of which the last two are None if goals
-      cannot change. Images are None without a camera.
+      Environment and model; the program of a reset, from a key to (first pose, goal, positions of
+      solid bodies, numbers of the observation, its images, next key); and that of the task's part
+      of a step, from (poses and action, goal, images before) to (numbers and scalars, images, goal,
+      positions of solid bodies). What a task or robot lacks or cannot change is None.
     """
     config = Config.model_validate_json(settings)
     env = make_env(config, task_class=task_class)
