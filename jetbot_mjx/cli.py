@@ -20,17 +20,8 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NoReturn, TypeVar
 
-from jetbot_mjx import startup
-from jetbot_mjx.errors import (
-    READER_LEFT,
-    NotFoundError,
-    UserError,
-    os_errors,
-    printable,
-    printable_lines,
-    ran_out,
-    write_error,
-)
+from jetbot_mjx import errors, startup
+from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import parse_goals
 from jetbot_mjx.interrupts import INTERRUPTED
 
@@ -42,6 +33,9 @@ PROGRAM = "jetbot-mjx"
 
 USER_ERROR = 2
 _BUG = 1
+
+_BY_POSITION = "config_by_position"
+"""Attribute of the parsed arguments with the `CONFIG` that no `--config` precedes."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -64,6 +58,8 @@ class Parser(argparse.ArgumentParser):
                 self.error(f"unrecognized arguments: {name}{self._remedy(word, name)}")
         parsed, extra = self.parse_known_args(words, namespace)
         assert parsed is not None
+        if by_position := getattr(parsed, _BY_POSITION, None):
+            parsed.config = by_position
         if extra:
             remedy = self._remedy(extra[0])
             half = [one for one in getattr(parsed, "overrides", []) if "=" not in one]
@@ -98,7 +94,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit with code 2."""
-        message = printable(" ".join(message.splitlines()))
+        message = errors.printable(" ".join(message.splitlines()))
         self.exit(USER_ERROR, f"{self.prog}: error: {message} (--help lists the arguments)\n")
 
 
@@ -194,7 +190,7 @@ def tell(text: str) -> None:
     Args:
       text: one line or several.
     """
-    print(printable_lines(text), flush=True)
+    print(errors.printable_lines(text), flush=True)
 
 
 def _report_error(error: BaseException) -> int | None:
@@ -209,7 +205,7 @@ def _report_error(error: BaseException) -> int | None:
             print(f"error: {error}", file=sys.stderr)
             return USER_ERROR
         # JAX raises a subclass, which is not named here because that would import JAX.
-        case RuntimeError() if ran_out(error):
+        case RuntimeError() if errors.ran_out(error):
             print(
                 "error: the device's memory is too small: choose a smaller --episodes",
                 file=sys.stderr,
@@ -228,8 +224,8 @@ def _report_lost_output(code: int, *, writes_files: bool) -> int:
     A reader that leaves, such as `head`, has read what it wanted.
     """
     sys.stdout.flush()
-    error = write_error(sys.stdout)
-    if error is None or error.errno in READER_LEFT:
+    error = errors.write_error(sys.stdout)
+    if error is None or error.errno in errors.READER_LEFT:
         return code
     failed = not (code or writes_files)
     kind = "error" if failed else "warning"
@@ -293,7 +289,6 @@ def number(kind: type[_Number], least: float, most: float = _LARGEST) -> Callabl
 
 whole_number = functools.partial(number, int)
 positive_int = whole_number(1)
-seed = whole_number(0, 2**32 - 1)
 fraction = number(float, 0, 1)
 
 
@@ -397,10 +392,10 @@ def find_policy(name: str) -> Path:
         from jetbot_mjx.runs import explain_missing, find_run
     path = find_run(name)
     what = f"no checkpoint at {path.absolute()}"
-    with os_errors(what):
+    with errors.os_errors(what):
         reason = explain_missing(path.absolute())
     if reason:
-        raise NotFoundError(f"{what}: {reason}")
+        raise errors.NotFoundError(f"{what}: {reason}")
     return path
 
 
@@ -435,21 +430,6 @@ def add_checkpoint_arguments(
     )
 
 
-class _KeepIfAbsent(argparse.Action):
-    """An action of a positional argument that may be absent: another one may have set its value."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: object,
-        option_string: str | None = None,
-    ) -> None:
-        """Store the value if there is one."""
-        if values is not None:
-            setattr(namespace, self.dest, values)
-
-
 def add_config_arguments(
     parser: argparse.ArgumentParser,
     group: "argparse._MutuallyExclusiveGroup | None" = None,
@@ -468,9 +448,7 @@ def add_config_arguments(
     same = "the configuration, in place of CONFIG"
     group.add_argument("--config", type=Path, metavar="CONFIG", help=same if positional else text)
     if positional:
-        group.add_argument(
-            "config", type=Path, nargs="?", action=_KeepIfAbsent, metavar="CONFIG", help=text
-        )
+        group.add_argument(_BY_POSITION, type=Path, nargs="?", metavar="CONFIG", help=text)
     parser.add_argument(
         "--set",
         dest="overrides",

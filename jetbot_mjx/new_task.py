@@ -23,11 +23,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="jetbot-mjx new-task", description=__doc__)
     parser.add_argument("module", type=Path, metavar="MODULE.py", help="file to be written")
-    files = write_task_template(parser.parse_args(arguments).module)
-    config = shlex.quote(str(files.config))
-    cli.tell(f"wrote {files.module} and {files.config}")
-    cli.tell(f"next: jetbot-mjx check-env --config {config}")
-    cli.tell(f"      jetbot-mjx train {config}")
+    module = parser.parse_args(arguments).module
+    config = write_task_template(module)
+    cli.tell(f"wrote {module} and {config}")
+    cli.tell(f"next: jetbot-mjx check-env --config {shlex.quote(str(config))}")
+    cli.tell(f"      jetbot-mjx train {shlex.quote(str(config))}")
     return 0
 
 

@@ -19,22 +19,14 @@ def _parser() -> cli.Parser:
     viewers = "a page in the browser, or MuJoCo's own window"
     cli.add_choice(parser, "--viewer", ("browser", "native"), viewers)
     cli.add_choice(parser, "--agent", _AGENTS, "initial driver; the page can switch it")
-    parser.add_argument(
-        "--seed",
-        type=cli.whole_number(0),
-        default=0,
-        help="random seed of the goals (default: 0)",
-    )
+    cli.add_count(parser, "--seed", "random seed of the goals", least=0, default=0)
     # At most as many as two CPU cores still drive in real time.
     cli.add_count(parser, "--robots", "number of robots that drive at once", most=256, default=1)
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen on (default: this machine alone)"
     )
-    parser.add_argument(
-        "--port",
-        type=cli.whole_number(1, _LARGEST_PORT),
-        help="port to listen on (default: 8080, or the next free one)",
-    )
+    port = "port to listen on (default: 8080, or the next free one)"
+    cli.add_count(parser, "--port", port, most=_LARGEST_PORT)
     parser.add_argument(
         "--allow-origin",
         dest="allow",

@@ -22,10 +22,9 @@ def _parser() -> cli.Parser:
     source = parser.add_mutually_exclusive_group()
     cli.add_config_arguments(parser, source)
     source.add_argument("--resume", metavar="RUN", help="continue the run in this folder")
-    parser.add_argument("--seed", type=cli.seed, help="random seed, the same as --set seed=N")
-    parser.add_argument(
-        "--seeds", type=cli.positive_int, help="train N policies at once, the same as --set seeds=N"
-    )
+    seed = "random seed, the same as --set seed=N"
+    cli.add_count(parser, "--seed", seed, least=0, most=2**32 - 1)
+    cli.add_count(parser, "--seeds", "train N policies at once, the same as --set seeds=N")
     parser.add_argument(
         "--init-from", metavar="RUN", help="start from the policy of another run, of any task"
     )

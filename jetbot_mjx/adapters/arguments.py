@@ -4,7 +4,6 @@ import math
 import numbers
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -18,15 +17,9 @@ Source = Config | Mapping[str, object] | str | Path | None
 """A configuration, nested settings, a YAML file, or None for the tutorial's configuration."""
 
 
-class TutorialArguments(NamedTuple):
-    """The arguments of the tutorial's constructor, which `JetBotGymEnv` documents."""
-
-    skip_frame: int
-    physics_dt: float | None
-    rendering_dt: float | None
-    max_episode_length: int | None
-    headless: bool
-    render_mode: str | None
+TutorialArguments = tuple[int, float | None, float | None, int | None, bool, str | None]
+"""skip_frame, physics_dt, rendering_dt, max_episode_length, headless and render_mode of the
+tutorial's constructor, which `JetBotGymEnv` documents."""
 
 
 def resolve(config: Source, given: TutorialArguments) -> tuple[Config, str | None, float]:

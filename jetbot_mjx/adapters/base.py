@@ -159,7 +159,7 @@ class BatchAdapter(AdapterBase):
           UserError: An argument or setting is wrong, or there is no display for a window.
         """
         given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
-        self._configure(config, TutorialArguments(*given))
+        self._configure(config, given)
         self.batch = BatchedEnv(self.config, num_envs, seed)
         self._set_spaces(*self._prepare(self.batch.env))
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.adapters.arguments import ResetKeys, Source, TutorialArguments, as_actions
+from jetbot_mjx.adapters.arguments import ResetKeys, Source, as_actions
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import unwrap_single
 from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
@@ -61,7 +61,7 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
             there is no display for a window.
         """
         given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
-        self._configure(config, TutorialArguments(*given))
+        self._configure(config, given)
         if drawn := ", ".join(self.config.randomization.drawn):
             raise UserError(
                 f"randomization.{drawn}: this environment has the preset's robot only: use"

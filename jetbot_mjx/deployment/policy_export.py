@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jetbot_mjx import runs
 from jetbot_mjx.deployment.exporters import FORMATS
 from jetbot_mjx.deployment.numpy_policy import (
     TOLERANCE,
@@ -18,14 +19,6 @@ from jetbot_mjx.deployment.numpy_policy import (
 )
 from jetbot_mjx.deployment.policy_spec import FILE, policy_spec
 from jetbot_mjx.errors import UserError, requires_extra
-from jetbot_mjx.runs import (
-    JsonObject,
-    Which,
-    atomic_folder,
-    load_checkpoint,
-    write_json,
-    writing_to,
-)
 from jetbot_mjx.terminal import stage
 
 FOLDER = "policy"
@@ -49,7 +42,7 @@ def export_policy(
     run_or_checkpoint: str | Path,
     *,
     formats: Sequence[str] = ("numpy",),
-    which: Which = "best",
+    which: runs.Which = "best",
     output: str | Path | None = None,
 ) -> ExportedPolicy:
     """Export one policy.
@@ -73,16 +66,16 @@ def export_policy(
             for package in FORMATS[name].needs:
                 importlib.import_module(package)
     # Load the policy.
-    checkpoint = load_checkpoint(run_or_checkpoint, which)
+    checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
     folder = checkpoint.run_dir / FOLDER if output is None else Path(output)
     env = checkpoint.make_env()
     policy, reference = portable_policy(checkpoint), as_jax(checkpoint, env)
-    with writing_to(folder):
+    with runs.writing_to(folder):
         if folder.exists() and not (folder / FILE).is_file():
             raise UserError(
                 f"{folder} exists and is not an export: choose a new folder with --output"
             )
-    with atomic_folder(folder) as unfinished:
+    with runs.atomic_folder(folder) as unfinished:
         recording = record(checkpoint, env)
         # Write each format and check its output against JAX.
         differences = {}
@@ -104,7 +97,7 @@ def export_policy(
 
 
 def _write_spec(
-    folder: Path, spec: JsonObject, differences: Mapping[str, float], recording: Recording
+    folder: Path, spec: runs.JsonObject, differences: Mapping[str, float], recording: Recording
 ) -> None:
     arrays = {**recording.inputs, **recording._asdict()}
     del arrays["inputs"]
@@ -114,7 +107,7 @@ def _write_spec(
         for name, found in differences.items()
     }
     spec["recording"] = {"file": RECORDING, "observations": len(recording.action)}
-    write_json(folder / FILE, spec)
+    runs.write_json(folder / FILE, spec)
 
 
 def summarize_export(exported: ExportedPolicy) -> str:

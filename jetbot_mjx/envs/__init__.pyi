@@ -38,10 +38,10 @@ from .state import State as State
 from .state import robot_state as robot_state
 from .task import GOAL_HEIGHT as GOAL_HEIGHT
 from .task import Field as Field
-from .task import FieldData as FieldData
 from .task import Goal as Goal
 from .task import GoalTask as GoalTask
 from .task import Layout as Layout
+from .task import LayoutData as LayoutData
 from .task import MovesGoal as MovesGoal
 from .task import RobotState as RobotState
 from .task import Task as Task

@@ -18,16 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt32
 
 from jetbot_mjx.config import Config, Overrides, load_config
-from jetbot_mjx.envs import kinematics, mjx
+from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, numbers_of, observation_shapes, see
 from jetbot_mjx.envs.physics import Physics
-from jetbot_mjx.envs.robot_model import (
-    CONTROLLER_WHEEL_RADIUS,
-    CONTROLLER_WHEEL_SEPARATION,
-    ROBOTS,
-    make_mj_model,
-)
 from jetbot_mjx.envs.state import Obs, PhysicsState, State, robot_state
 from jetbot_mjx.envs.task import (
     AdvancesGoal,
@@ -88,9 +82,9 @@ class JetBotEnv(Env):
         """
         self.config = config
         self.task: Task = make_task(config.task, task_class)
-        self.robot = ROBOTS[config.robot.preset]
+        self.robot = robot_model.ROBOTS[config.robot.preset]
         make_model = functools.partial(
-            make_mj_model, self.robot, config.physics, build_scene=self.task.build_scene
+            robot_model.make_mj_model, self.robot, config.physics, build_scene=self.task.build_scene
         )
         try:
             self.mj_model: mujoco.MjModel = make_model()
@@ -318,8 +312,8 @@ class JetBotEnv(Env):
         )
         return kinematics.wheel_speeds(
             twist_b,
-            wheel_radius=CONTROLLER_WHEEL_RADIUS,
-            wheel_separation=CONTROLLER_WHEEL_SEPARATION,
+            wheel_radius=robot_model.CONTROLLER_WHEEL_RADIUS,
+            wheel_separation=robot_model.CONTROLLER_WHEEL_SEPARATION,
         )
 
     @property

@@ -50,20 +50,6 @@ class Step(NamedTuple):
     """Whether state, observation and reward are finite; if not, the step was discarded."""
 
 
-class _Programs(NamedTuple):
-    """A `_Programs` holds the model and programs that robots of one configuration share."""
-
-    env: JetBotEnv
-    model: mujoco.MjModel
-    reset: jax.stages.Compiled
-    """From a key to (first pose, goal, positions of solid bodies, numbers of the observation, its
-    images, next key)."""
-    task_step: jax.stages.Compiled
-    """From (poses and action, goal, images before) to (numbers and scalars of the step, images,
-    goal, positions of solid bodies); the last two are None if goals cannot change. Images are None
-    without a camera."""
-
-
 class MujocoJetBot:
     """A `MujocoJetBot` simulates one robot and its goal."""
 
@@ -176,12 +162,20 @@ class MujocoJetBot:
 
 
 @functools.lru_cache(maxsize=8)
-def _programs(settings: str, task_class: TaskClass | None) -> _Programs:
-    """Build the environment, model and programs of a configuration.
+def _programs(
+    settings: str, task_class: TaskClass | None
+) -> tuple[JetBotEnv, mujoco.MjModel, jax.stages.Compiled, jax.stages.Compiled]:
+    """Build what robots of one configuration share: environment, model and two programs.
 
     Args:
       settings: the configuration as JSON, since a `Config` is not hashable.
       task_class: as for `MujocoJetBot`.
+
+    Returns:
+      Environment and model; the program of a reset, from a key to (first pose, goal, positions of
+      solid bodies, numbers of the observation, its images, next key); and that of the task's part
+      of a step, from (poses and action, goal, images before) to (numbers and scalars, images, goal,
+      positions of solid bodies). What a task or robot lacks or cannot change is None.
     """
     config = Config.model_validate_json(settings)
     env = make_env(config, task_class=task_class)
@@ -227,7 +221,7 @@ def _programs(settings: str, task_class: TaskClass | None) -> _Programs:
         reset_program = jax.jit(reset).lower(key).compile()
         _, goal, _, _, images, _ = reset_program(key)
         task_program = jax.jit(task_step).lower(given, goal, images).compile()
-    return _Programs(env, model, reset_program, task_program)
+    return env, model, reset_program, task_program
 
 
 def _vector(obs: Obs) -> Float[Array, " obs"]:

@@ -91,7 +91,9 @@ def in_mujoco(
             f"JAX_PLATFORMS = {os.environ.get('JAX_PLATFORMS')!r} leaves out the CPU, on which C"
             " MuJoCo runs: add it, as in JAX_PLATFORMS=cuda,cpu"
         ) from None
-    return env.with_physics(MujocoPhysics(env, numerics, threads or _cores()))
+    # Not every system tells which cores a process may use.
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return env.with_physics(MujocoPhysics(env, numerics, threads or cores or 1))
 
 
 def make_model(env: JetBotEnv, numerics: Numerics) -> mujoco.MjModel:
@@ -306,10 +308,3 @@ class _ModelCache:
         # Recompute the constants that MuJoCo derives from masses and positions.
         mujoco.mj_setConst(model, self._data)
         return model
-
-
-def _cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypedDict, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -89,18 +89,14 @@ def layout_size(layout: Layout) -> int:
     return sum(field.size for field in layout)
 
 
-class FieldData(TypedDict):
-    """A field as JSON."""
-
-    name: str
-    size: int
-    unit: str
-    frame: str
+LayoutData = Sequence[Mapping[str, Any]]
+"""The fields of an observation, as checkpoints store them: name, size, unit and frame of each."""
 
 
-def layout_data(layout: Layout) -> list[FieldData]:
-    """Return a layout as JSON for the users of a trained policy: all fields but `min_std`."""
-    return [FieldData(name=x.name, size=x.size, unit=x.unit, frame=x.frame) for x in layout]
+def layout_data(layout: Layout) -> LayoutData:
+    """Return a layout as JSON for the users of a trained policy: all but `min_std`."""
+    names = Field._fields[:-1]
+    return [{name: getattr(field, name) for name in names} for field in layout]
 
 
 def min_std(field: Field) -> float:

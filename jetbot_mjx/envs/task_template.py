@@ -3,7 +3,6 @@
 import importlib.util
 import keyword
 from pathlib import Path
-from typing import NamedTuple
 
 from jetbot_mjx.config import shipped_folder
 from jetbot_mjx.errors import UserError
@@ -12,14 +11,7 @@ _EXAMPLE = ("obstacle_task.py", "obstacle.yaml")
 """The files that are copied."""
 
 
-class TaskFiles(NamedTuple):
-    """A `TaskFiles` tuple holds the paths of a task's two files."""
-
-    module: Path
-    config: Path
-
-
-def write_task_template(path: Path) -> TaskFiles:
+def write_task_template(path: Path) -> Path:
     """Write a task and its settings, without overwriting anything.
 
     Args:
@@ -27,7 +19,7 @@ def write_task_template(path: Path) -> TaskFiles:
         the same folder.
 
     Returns:
-      The files.
+      The path of the settings.
 
     Raises:
       UserError: the name is not valid or belongs to another module, or a file exists already.
@@ -36,7 +28,8 @@ def write_task_template(path: Path) -> TaskFiles:
     name = path.stem
     if path.suffix != ".py" or not name.isidentifier() or keyword.iskeyword(name):
         raise UserError(f"{path}: name a Python module, such as my_task.py")
-    files = TaskFiles(path, path.with_suffix(".yaml"))
+    config = path.with_suffix(".yaml")
+    files = path, config
     for file in files:
         if file.exists():
             raise UserError(f"{file} exists already: choose another name")
@@ -44,7 +37,7 @@ def write_task_template(path: Path) -> TaskFiles:
         raise UserError(f"{path}: a module {name} exists already: choose another name")
     # Copy the example under the new names.
     renamed = {
-        "jetbot-mjx train obstacle": f"jetbot-mjx train {files.config.name}",
+        "jetbot-mjx train obstacle": f"jetbot-mjx train {config.name}",
         "obstacle_task": name,
         "ObstacleTask": "".join(word[:1].upper() + word[1:] for word in name.split("_")),
     }
@@ -59,4 +52,4 @@ def write_task_template(path: Path) -> TaskFiles:
                 out.write(text)
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None
-    return files
+    return config

@@ -63,12 +63,12 @@ def find(config: Config, episodes: Episodes) -> Float[np.ndarray, " n"] | str:
     if not searches:
         return "no search was made for these goals"
     ours = settings_of(config)
-    differing = [
-        [name for name in SETTINGS if one["settings"][name] != ours[name]] for one in searches
-    ]
-    nearest = min(range(len(searches)), key=lambda index: len(differing[index]))
-    search, names = searches[nearest], differing[nearest]
-    if names:
+
+    def differing(search: JsonObject) -> list[str]:
+        return [name for name in SETTINGS if search["settings"][name] != ours[name]]
+
+    search = min(searches, key=lambda one: len(differing(one)))
+    if names := differing(search):
         stated = ", ".join(f"{name} = {search['settings'][name]}" for name in names)
         own = ", ".join(str(ours[name]) for name in names)
         return f"the search was made for {stated}, and this run has {own}"

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, TypedDict, get_args
+from typing import Literal, NamedTuple, TypedDict, Unpack, get_args
 
 import jax
 
+from jetbot_mjx import runs
 from jetbot_mjx.config import RandomizationConfig, load_config
 from jetbot_mjx.envs import OTHER_NUMERICS, DomainRandomizationWrapper, Numerics
 from jetbot_mjx.errors import InvalidError, UserError
@@ -23,19 +24,7 @@ from jetbot_mjx.evaluation.report import (
 )
 from jetbot_mjx.evaluation.result_names import find_report, name_with_count, report_folder
 from jetbot_mjx.evaluation.robustness import SWEEP_GOALS, MujocoEvaluator, MujocoResult, Sweeper
-from jetbot_mjx.runs import (
-    METRICS,
-    Checkpoint,
-    JsonObject,
-    Setup,
-    Which,
-    check_writable,
-    load_checkpoint,
-    read_history,
-    seed_folders,
-    shortened,
-    versions,
-)
+from jetbot_mjx.runs import Checkpoint, JsonObject, Setup, Which, check_writable, load_checkpoint
 from jetbot_mjx.terminal import stage
 
 Simulator = Literal["mujoco"]
@@ -48,36 +37,29 @@ class ReportOptions(TypedDict, total=False):
     """The keyword arguments of `evaluate_run` and `compare_runs`."""
 
     episodes: int
+    """Number of fixed goals, from the first on; by default `REPORT_GOALS`."""
     which: Which
+    """Checkpoint of a run folder, of each seed; by default `best`."""
     output: str | Path | None
+    """Folder to write; None: of a report the one in `evaluations/` of the run folder that
+    `report_folder` chooses, so that no fuller report is replaced; of a comparison
+    `evaluations/comparison/` of the first run, whose name ends with the number of goals if they are
+    not as many as by default."""
     robustness: bool
+    """Whether to evaluate also on robots that differ from the preset, and in C MuJoCo."""
     ranges: str | Path | None
+    """Configuration file with ranges below `randomization`. A policy is evaluated also on one robot
+    sampled from them for each goal. None: the ranges of the run, if any."""
     simulator: Simulator | None
+    """Second simulator in which a policy is evaluated too, or None."""
 
 
-def evaluate_run(
-    run_or_checkpoint: str | Path,
-    *,
-    episodes: int = REPORT_GOALS,
-    which: Which = "best",
-    output: str | Path | None = None,
-    robustness: bool = False,
-    ranges: str | Path | None = None,
-    simulator: Simulator | None = None,
-) -> Report:
+def evaluate_run(run_or_checkpoint: str | Path, **options: Unpack[ReportOptions]) -> Report:
     """Evaluate one policy and write its report.
 
     Args:
       run_or_checkpoint: A run folder, or one of its checkpoint folders.
-      episodes: The number of fixed goals, from the first on.
-      which: The checkpoint of a run folder.
-      output: The folder to write, or None for the one in `evaluations/` of the run folder that
-        `report_folder` chooses, so that no fuller report is replaced.
-      robustness: Whether to evaluate the policy also on robots that differ from the preset, and in
-        C MuJoCo.
-      ranges: A configuration file with ranges below `randomization`. The policy is evaluated also
-        on one robot sampled from them for each goal. None means the ranges of the run, if any.
-      simulator: A second simulator in which the policy is evaluated too, or None.
+      **options: What to evaluate, and where to write it.
 
     Returns:
       The report, which names its folder.
@@ -85,10 +67,10 @@ def evaluate_run(
     Raises:
       UserError: there is no usable checkpoint, or the folder cannot be written.
     """
-    checkpoint = load_checkpoint(run_or_checkpoint, which)
-    check_writable(Path(output or checkpoint.results_dir / _FOLDER))
-    reporter = _Reporter(episodes, robustness, ranges, simulator)
-    return reporter.write(checkpoint, checkpoint.make_setup(), output)
+    reporter = _Reporter(**options)
+    checkpoint = load_checkpoint(run_or_checkpoint, reporter.which)
+    check_writable(Path(reporter.output or checkpoint.results_dir / _FOLDER))
+    return reporter.write(checkpoint, checkpoint.make_setup(), reporter.output)
 
 
 def evaluate_in_mujoco(
@@ -123,29 +105,14 @@ def evaluate_in_mujoco(
     return evaluator.run(checkpoint.params, report_keys(episodes))
 
 
-def compare_runs(
-    runs: Sequence[str | Path],
-    *,
-    episodes: int = REPORT_GOALS,
-    which: Which = "best",
-    output: str | Path | None = None,
-    robustness: bool = False,
-    ranges: str | Path | None = None,
-    simulator: Simulator | None = None,
-) -> Comparison:
+def compare_runs(runs: Sequence[str | Path], **options: Unpack[ReportOptions]) -> Comparison:
     """Evaluate the policies of several runs or seeds, write a report on each, and compare them.
 
     The report on a policy is not written again if there is one that is at least as full.
 
     Args:
       runs: Run folders, of one seed or several, or checkpoint folders.
-      episodes: The number of fixed goals, from the first on.
-      which: The checkpoint of a run folder, of each seed.
-      output: The folder for the comparison, or None for `evaluations/comparison/` of the first run,
-        whose name ends with the number of goals if they are not as many as by default.
-      robustness: Whether each policy is also evaluated on other robots and in C MuJoCo.
-      ranges: As for `evaluate_run`.
-      simulator: As for `evaluate_run`.
+      **options: What to evaluate, and where to write the comparison.
 
     Returns:
       The comparison, which names its folder. Each of its reports names its own.
@@ -154,12 +121,13 @@ def compare_runs(
       UserError: a checkpoint cannot be used or is named twice, the runs have different tasks, or a
         folder cannot be written.
     """
+    reporter = _Reporter(**options)
     # Load all policies and check that they can be compared.
-    entries = _load_runs([Path(path) for path in runs], which)
+    entries = _load_runs([Path(path) for path in runs], reporter.which)
     check_comparable({name: entry.first.config for name, entry in entries.items()})
     first = next(iter(entries.values())).folder
-    name = name_with_count("comparison", episodes, REPORT_GOALS, "-goals")
-    folder = first / _FOLDER / name if output is None else Path(output)
+    name = name_with_count("comparison", reporter.episodes, REPORT_GOALS, "-goals")
+    folder = Path(reporter.output or first / _FOLDER / name)
     # Build all environments first, so that an unsuitable policy is rejected before any writing.
     policies = [
         (name, seed, checkpoint, checkpoint.make_setup())
@@ -169,7 +137,6 @@ def compare_runs(
     for path in (folder, *(checkpoint.results_dir / _FOLDER for _, _, checkpoint, _ in policies)):
         check_writable(path)
     # Evaluate each policy and write its report.
-    reporter = _Reporter(episodes, robustness, ranges, simulator)
     by_run: dict[str, dict[str, Report]] = {name: {} for name in entries}
     with stage("policies", len(policies)) as advance:
         for name, seed, checkpoint, setup in policies:
@@ -214,14 +181,14 @@ def _load_runs(paths: Sequence[Path], which: Which) -> dict[str, RunEntry]:
     entries: list[RunEntry] = []
     owners: dict[Path, Path] = {}
     for path in paths:
-        folders = seed_folders(path)
+        folders = runs.seed_folders(path)
         seeds = {one.name: load_checkpoint(one, which) for one in folders or [path]}
         for checkpoint in seeds.values():
             place = checkpoint.path.resolve()
             if place in owners:
                 raise UserError(
-                    f"{path} and {owners[place]} are the same policy, {shortened(checkpoint.path)}:"
-                    " name each once"
+                    f"{path} and {owners[place]} are the same policy,"
+                    f" {runs.shortened(checkpoint.path)}: name each once"
                 )
             owners[place] = path
         first = next(iter(seeds.values()))
@@ -253,15 +220,20 @@ class _Reporter:
 
     def __init__(
         self,
-        episodes: int,
-        robustness: bool,
-        ranges: str | Path | None,
-        simulator: Simulator | None,
+        *,
+        episodes: int = REPORT_GOALS,
+        which: Which = "best",
+        output: str | Path | None = None,
+        robustness: bool = False,
+        ranges: str | Path | None = None,
+        simulator: Simulator | None = None,
     ) -> None:
-        """Take the options of `evaluate_run`."""
+        """Take the options, as `ReportOptions` explains them."""
         if simulator not in (None, *get_args(Simulator)):
             raise InvalidError(f"simulator = {simulator!r} is unknown: give 'mujoco' or None")
-        self._keys, self._versions = report_keys(episodes), versions()
+        self.episodes, self.output = episodes, output
+        self.which: Which = which
+        self._keys, self._versions = report_keys(episodes), runs.versions()
         self._robustness, self._in_mujoco = robustness, robustness or simulator is not None
         self._pictures = simulator is not None
         self._ranges, self._ranges_file = _read_ranges(ranges), ranges
@@ -347,8 +319,8 @@ class _Reporter:
         self._build(checkpoint, setup, ranges)
         finished = jax.device_get(self._nominal.run(checkpoint.params, self._keys))
         best_known, missing = compare_with_best_known(config, finished)
-        run_dir = shortened(checkpoint.run_dir)
-        history = read_history(checkpoint.run_dir / METRICS)
+        run_dir = runs.shortened(checkpoint.run_dir)
+        history = runs.read_history(checkpoint.run_dir / runs.METRICS)
         report = Report(
             folder=Path(output or fuller or report_folder(*wanted)),
             run=run_dir,

@@ -175,19 +175,15 @@ class Report(NamedTuple):
 
     def evaluate_command(self) -> str:
         """Return the command line that creates this report."""
+        # `--robustness` alone evaluates in C MuJoCo too, but without pictures.
+        asks_for_mujoco = self.mujoco and (self.mujoco.rendered is not None or not self.robustness)
         return (
             f"jetbot-mjx evaluate {shlex.quote(str(self.run))}"
             f" --checkpoint {self.env_steps} --episodes {self.policy.episodes}"
             f"{' --robustness' if self.robustness else ''}"
-            f"{' --simulator mujoco' if self._asks_for_mujoco else ''}"
+            f"{' --simulator mujoco' if asks_for_mujoco else ''}"
             f"{f' --ranges {shlex.quote(str(self.ranges_file))}' if self.ranges_file else ''}"
         )
-
-    @property
-    def _asks_for_mujoco(self) -> bool:
-        """Return whether C MuJoCo was asked for by itself, and not only by `--robustness`."""
-        found = self.mujoco
-        return found is not None and (found.rendered is not None or not self.robustness)
 
     def to_json(self) -> JsonObject:
         """Return everything except the episodes and images as JSON values."""

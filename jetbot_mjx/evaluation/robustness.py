@@ -7,32 +7,19 @@ does not see. The evaluation in C MuJoCo uses the same robot with numerics that 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
+from jetbot_mjx import envs
 from jetbot_mjx.agents import PolicyParams
 from jetbot_mjx.config import QUANTITIES, LookParams, RandomizationConfig, RobotParams
 from jetbot_mjx.devices import default_device_cpu
-from jetbot_mjx.envs import (
-    OTHER_NUMERICS,
-    DomainRandomizationWrapper,
-    JetBotEnv,
-    MujocoCamera,
-    Numerics,
-    SceneryKind,
-    in_mujoco,
-)
-from jetbot_mjx.evaluation.evaluator import (
-    BASELINES,
-    Evaluator,
-    Summary,
-    json_values,
-    policy_controller,
-    summarize,
-)
+from jetbot_mjx.envs import DomainRandomizationWrapper, Numerics
+from jetbot_mjx.evaluation import evaluator
+from jetbot_mjx.evaluation.evaluator import Evaluator, Summary, summarize
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
 from jetbot_mjx.runs import JsonObject, Setup
@@ -50,8 +37,6 @@ Variant = tuple[RobotParams, LookParams]
 
 RENDERED_GOALS = 256
 """Number of the report's fixed goals that a policy drives to by MuJoCo's pictures."""
-
-_SCENERY_KINDS: tuple[SceneryKind, ...] = ("plain", "varied")
 
 
 class Sweep(NamedTuple):
@@ -126,7 +111,7 @@ class Sweeper:
         # batch has converged, so those that slide would slow down the rest. A GPU needs the whole
         # batch to be busy.
         self._at_once = 1 if jax.default_backend() == "cpu" else len(self._variants)
-        controllers = [policy_controller(networks), BASELINES["scripted"](env)]
+        controllers = [evaluator.policy_controller(networks), evaluator.BASELINES["scripted"](env)]
         length = env.config.task.episode_length
 
         def run_episodes(
@@ -210,7 +195,7 @@ class MujocoEvaluator:
         self,
         setup: Setup,
         ranges: RandomizationConfig | None = None,
-        numerics: Numerics = OTHER_NUMERICS,
+        numerics: Numerics = envs.OTHER_NUMERICS,
         *,
         pictures: bool = False,
     ) -> None:
@@ -230,16 +215,16 @@ class MujocoEvaluator:
         """
         env, networks, programs = setup.env, setup.networks, setup.programs
         self._numerics, self._dt = numerics, env.dt
-        simulator = in_mujoco(env, numerics)
-        envs: list[JetBotEnv | DomainRandomizationWrapper] = [simulator]
+        simulator = envs.in_mujoco(env, numerics)
+        robots: list[envs.JetBotEnv | DomainRandomizationWrapper] = [simulator]
         if ranges is not None and ranges.drawn:
-            envs.append(DomainRandomizationWrapper(simulator, ranges=ranges))
-        self._evaluators = [Evaluator(one, networks, programs) for one in envs]
-        self._rendered: dict[SceneryKind, Evaluator] = {}
+            robots.append(DomainRandomizationWrapper(simulator, ranges=ranges))
+        self._evaluators = [Evaluator(one, networks, programs) for one in robots]
+        self._rendered: dict[envs.SceneryKind, Evaluator] = {}
         if pictures and env.camera is not None:
             config, model = env.camera.config, env.mj_model
-            for name in _SCENERY_KINDS:
-                camera = MujocoCamera(config, model, appearance=name)
+            for name in get_args(envs.SceneryKind):
+                camera = envs.MujocoCamera(config, model, appearance=name)
                 own = Evaluator(simulator.with_camera(camera), networks, programs)
                 self._rendered[name] = own
 
@@ -307,4 +292,4 @@ def as_json(results: Sequence[SweepResult]) -> JsonObject:
             for result in results
         ],
     }
-    return json_values(values)
+    return evaluator.json_values(values)

@@ -10,18 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float, UInt32
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from jetbot_mjx.agents import (
-    Networks,
-    Observation,
-    Policy,
-    PolicyParams,
-    init_normalizer,
-    make_networks,
-    make_policy,
-)
+from jetbot_mjx import agents
+from jetbot_mjx.agents import Networks, Policy, PolicyParams
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.devices import require_float32
-from jetbot_mjx.envs import FieldData, JetBotEnv, layout_data
+from jetbot_mjx.envs import JetBotEnv, LayoutData, layout_data
 from jetbot_mjx.errors import InvalidError, UserError, os_errors, shown
 from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint_store import FOLDER, CheckpointError, CheckpointNotFoundError
@@ -39,9 +32,6 @@ POLICY = "policy"
 
 FORMAT = "jetbot_mjx/3"
 """Format of a checkpoint's content; checkpoints of other formats cannot be read."""
-
-LayoutData = Sequence[FieldData]
-"""The fields of an observation, as checkpoints store them."""
 
 _Size = Annotated[int, Field(ge=1, lt=2**24)]
 
@@ -157,10 +147,10 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
     size = about["observation_size"]
     try:
         config = parse_config(about["config"], source="stored config")
-        networks = make_networks(config.ppo, size, about["action_size"])
+        networks = agents.make_networks(config.ppo, size, about["action_size"])
         template = jax.eval_shape(
             lambda key: PolicyParams(
-                init_normalizer(size),
+                agents.init_normalizer(size),
                 networks.policy_network.init(key),
                 networks.value_network.init(key),
             ),
@@ -228,11 +218,11 @@ def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
       CheckpointError: as for `load_checkpoint`.
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
-    policy = make_policy(checkpoint.networks, checkpoint.params)
+    policy = agents.make_policy(checkpoint.networks, checkpoint.params)
     size, layout = checkpoint.about["observation_size"], checkpoint.about["layout"]
 
     def checked_policy(
-        obs: Observation, key: UInt32[Array, "2"] | None = None
+        obs: agents.Observation, key: UInt32[Array, "2"] | None = None
     ) -> Float[Array, "*batch action"]:
         if isinstance(size, int):
             _check_numbers(obs, size, layout)
@@ -243,7 +233,7 @@ def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
     return checked_policy
 
 
-def _check_numbers(obs: Observation, size: int, layout: LayoutData) -> None:
+def _check_numbers(obs: agents.Observation, size: int, layout: LayoutData) -> None:
     """Raise an error if an observation is no vector of a length, or a batch of such."""
     if isinstance(obs, Mapping):
         raise InvalidError(f"observation: expected {size} numbers; got {_parts(obs)}")
@@ -253,7 +243,7 @@ def _check_numbers(obs: Observation, size: int, layout: LayoutData) -> None:
         raise InvalidError(f"observation: expected {size} numbers, {_names(layout)}; got {given}")
 
 
-def _check_parts(obs: Observation, shapes: Mapping[str, Sequence[int]]) -> None:
+def _check_parts(obs: agents.Observation, shapes: Mapping[str, Sequence[int]]) -> None:
     """Raise an error if an observation lacks parts of the given shapes, or a batch of such."""
     wanted = "{" + ", ".join(f"{name}: {list(shape)}" for name, shape in shapes.items()) + "}"
     if not isinstance(obs, Mapping):

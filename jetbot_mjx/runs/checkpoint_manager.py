@@ -26,9 +26,14 @@ def open_manager(
     Returns:
       Orbax's manager.
     """
+    me = jax.process_index()
+    # Orbax is not to wait for other processes, which do not write.
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process-{me}"
+    )
     options = ocp.CheckpointManagerOptions(
         create=False,
-        multiprocessing_options=_single_process_options(),
+        multiprocessing_options=alone,
         step_name_format=ocp.path.step.standard_name_format(step_format_fixed_length=step_digits),
         preservation_policy=_PreserveBestAndLatest(keep, success),
         cleanup_tmp_directories=True,
@@ -79,11 +84,3 @@ class _PreserveBestAndLatest(checkpoint_managers.PreservationPolicy):
         best = max(range(len(success)), key=lambda index: (success[index], index), default=0)
         first_of_latest = len(checkpoints) - self._latest
         return [index in (0, best) or index >= first_of_latest for index in range(len(checkpoints))]
-
-
-def _single_process_options() -> ocp.options.MultiprocessingOptions:
-    """Return options with which Orbax does not wait for other processes, which do not write."""
-    me = jax.process_index()
-    return ocp.options.MultiprocessingOptions(
-        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process-{me}"
-    )

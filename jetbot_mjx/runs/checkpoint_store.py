@@ -38,7 +38,7 @@ import shutil
 import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -84,7 +84,7 @@ class CheckpointNotFoundError(CheckpointError, NotFoundError):
     """Raised when there is no checkpoint at a path."""
 
 
-class CheckpointStore:
+class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
     """A `CheckpointStore` writes the checkpoints of one run.
 
     It is a context manager that waits for the last write. Writing runs in the background, one
@@ -159,10 +159,6 @@ class CheckpointStore:
                 )
             if not start_save(self._manager, env_steps, arrays, {_ABOUT: about}):
                 raise ValueError(f"there is one after {env_steps} steps or more")
-
-    def __enter__(self) -> Self:
-        """Return the store itself."""
-        return self
 
     def __exit__(self, *exception: object) -> None:
         """Wait until all checkpoints are on disk, and close the store."""

@@ -26,6 +26,7 @@ timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.p
   time/wall_seconds         time of all processes that worked on the run, from their start
 """
 
+import contextlib
 import json
 import math
 import os
@@ -35,7 +36,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, NamedTuple, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from tensorboardX import summary as tensorboard_summary
@@ -293,7 +294,7 @@ class TensorBoardSink:
         self._writer.close()
 
 
-class CompileClock:
+class CompileClock(contextlib.AbstractContextManager["CompileClock"]):
     """A `CompileClock` measures the time that JAX reports for tracing, lowering and compiling.
 
     It is a context manager that unregisters its listeners at the end. Where threads compile in
@@ -349,10 +350,6 @@ class CompileClock:
             until = max(until, end)
         self._counted_until = until
         return seconds
-
-    def __enter__(self) -> Self:
-        """Return the object itself."""
-        return self
 
     def __exit__(self, *exception: object) -> None:
         """Unregister the listeners."""

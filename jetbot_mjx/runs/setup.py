@@ -2,16 +2,10 @@
 
 import functools
 
+from jetbot_mjx import envs
 from jetbot_mjx.agents import Networks, make_networks
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs import (
-    BatchWrapper,
-    JetBotEnv,
-    Task,
-    make_env,
-    open_program_cache,
-    wrap_for_training,
-)
+from jetbot_mjx.envs import JetBotEnv
 from onekernel import ProgramCache
 
 
@@ -24,7 +18,7 @@ class Setup:
         programs: ProgramCache | None = None,
         *,
         env: JetBotEnv | None = None,
-        task_class: type[Task] | None = None,
+        task_class: type[envs.Task] | None = None,
         networks: Networks | None = None,
     ) -> None:
         """Describe what to build; what is given is not built again.
@@ -38,7 +32,7 @@ class Setup:
           networks: networks that fit the environment; None: they are built.
         """
         self.config = config
-        self.programs = programs or open_program_cache(config, keep=False)
+        self.programs = programs or envs.open_program_cache(config, keep=False)
         """The cache of compiled programs, which has the compiler's options."""
         self._env, self._task_class, self._networks = env, task_class, networks
 
@@ -49,12 +43,12 @@ class Setup:
         Raises:
           UserError: the task or its scene cannot be built.
         """
-        return self._env or make_env(self.config, task_class=self._task_class)
+        return self._env or envs.make_env(self.config, task_class=self._task_class)
 
     @functools.cached_property
-    def training_env(self) -> BatchWrapper:
+    def training_env(self) -> envs.BatchWrapper:
         """Return the environment in the wrappers of a training, batched."""
-        return wrap_for_training(self.env, self.config.task.episode_length)
+        return envs.wrap_for_training(self.env, self.config.task.episode_length)
 
     @functools.cached_property
     def networks(self) -> Networks:

@@ -24,9 +24,9 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jetbot_mjx.agents import PolicyParams, TrainState, UInt64, last_layer, make_policy
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs import JetBotEnv, State, layout_data
+from jetbot_mjx.envs import JetBotEnv, LayoutData, State, layout_data
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs.checkpoint import Checkpoint, LayoutData
+from jetbot_mjx.runs.checkpoint import Checkpoint
 from jetbot_mjx.runs.run_dir import JsonObject
 from jetbot_mjx.runs.setup import Setup
 

@@ -122,14 +122,11 @@ def rename_metrics(metrics: Mapping[str, jax.Array], entropy_cost: float) -> dic
 
 @contextlib.contextmanager
 def device_put_replicated() -> Iterator[None]:
-    """Add to JAX ≥ 0.10 the function that it removed and that Brax 0.14.2 still calls.
+    """Add to JAX the function that 0.10 removed and that Brax 0.14.2 still calls.
 
     The mesh axis is named `i`, as in Brax's `pmap`: under any other name the shardings of
     the first and the later epochs differ, and the epoch compiles twice.
     """
-    if hasattr(jax, "device_put_replicated"):
-        yield
-        return
 
     def device_put_replicated(tree: PyTree, devices: Sequence[object]) -> PyTree:
         sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))

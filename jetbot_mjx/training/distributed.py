@@ -6,13 +6,15 @@ make the same collective calls in the same order, and none waits for a process t
 """
 
 import os
+import pickle
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
-from jaxtyping import Int, PyTree
+from jaxtyping import Int
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
@@ -24,8 +26,12 @@ JOIN_SECONDS = 120
 _ADDRESS = "JAX_COORDINATOR_ADDRESS"
 _COUNT = "JAX_NUM_PROCESSES"
 _INDEX = "JAX_PROCESS_ID"
+_BLOCK = 4096
+"""Bytes are counted in blocks of this size, so that the number of blocks fits into 32 bits."""
 _FAILED = -1
 _USER_ERROR = 2
+
+_Value = TypeVar("_Value")
 
 
 def check_processes(config: Config) -> None:
@@ -131,58 +137,33 @@ def run_on_primary(action: Callable[[], int | None]) -> int:
     return outcome
 
 
-def broadcast_from_primary(trees: Sequence[PyTree], template: PyTree, count: int) -> list[PyTree]:
-    """Copy arrays of the first process to all processes, bit for bit.
+def broadcast_from_primary(source: Callable[[], _Value]) -> _Value:
+    """Copy a value of the first process to all processes, bit for bit.
 
     Args:
-      trees: arrays on the host; those of the other processes are ignored.
-      template: shapes and dtypes of one tree.
-      count: number of trees.
+      source: a function that returns the value, which only the first process calls. The value
+        consists of arrays on the host, and of classes that every process can import.
 
     Returns:
-      The first process's trees, on every host.
-    """
-    if jax.process_count() == 1:
-        return list(trees)
-    shapes, structure = jax.tree.flatten([template] * count)
-    sizes = [int(np.prod(x.shape, dtype=int)) * np.dtype(x.dtype).itemsize for x in shapes]
-    local = np.zeros(sum(sizes), np.uint8)
-    if is_primary():
-        leaves = jax.tree.leaves(list(trees))
-        local = np.concatenate([np.ascontiguousarray(x).reshape(-1).view(np.uint8) for x in leaves])
-    # Broadcast bytes: JAX broadcasts by a sum, in which a float loses the sign of a zero.
-    content = np.asarray(multihost_utils.broadcast_one_to_all(local))
-    parts = np.split(content, np.cumsum(sizes)[:-1])
-    arrays = [
-        part.view(np.dtype(x.dtype)).reshape(x.shape) for part, x in zip(parts, shapes, strict=True)
-    ]
-    return jax.tree.unflatten(structure, arrays)
-
-
-def broadcast_bytes(source: Callable[[], bytes]) -> bytes:
-    """Copy bytes of the first process to all processes.
-
-    Args:
-      source: a function that returns the bytes, which only the first process calls.
-
-    Returns:
-      The first process's bytes, on every host.
+      The first process's value, on every host.
 
     Raises:
       UserError: as for `run_on_primary`.
     """
+    if jax.process_count() == 1:
+        return source()
     content = b""
 
     def measure() -> int:
         nonlocal content
-        content = source()
-        return len(content)
+        content = pickle.dumps(source())
+        return -(-len(content) // _BLOCK)
 
-    length = run_on_primary(measure)
-    if jax.process_count() == 1 or length == 0:
-        return content
-    local = np.frombuffer(content or bytes(length), np.uint8)
-    return np.asarray(multihost_utils.broadcast_one_to_all(local)).tobytes()
+    blocks = run_on_primary(measure)
+    # Broadcast bytes: JAX broadcasts by a sum, in which a float loses the sign of a zero.
+    local = np.frombuffer(content.ljust(blocks * _BLOCK, b"\0"), np.uint8)
+    # What follows the pickled value is ignored.
+    return pickle.loads(np.asarray(multihost_utils.broadcast_one_to_all(local)).tobytes())
 
 
 def _read_environment() -> tuple[str | None, int | None, int | None]:

@@ -231,11 +231,9 @@ class MemoryModel(NamedTuple):
           Its footprint; None if none fits.
         """
         power = -1
-        while found := self.resized(2.0**power):
-            if limit is None or found.total <= limit:
-                return found
+        while (found := self.resized(2.0**power)) and limit is not None and found.total > limit:
             power -= 1
-        return None
+        return found
 
     def advice(self, limit: int | None) -> str:
         """Return the error message for a training that ran out of memory.

@@ -273,7 +273,7 @@ def train(
             return
         running = gathered[:, 1].any()
     advance = compiling.result()
-    stop.begin_training()
+    stop.compiling = None
     recorder.on_compiled()
     _train_loop(trainer, advance, recorder, stop, checkpoint_interval, state, done)
 

@@ -48,7 +48,10 @@ class StopRequest(contextlib.AbstractContextManager["StopRequest"]):
         """
         self.notice = notice
         self._requested = threading.Event()
-        self._compiling: Callable[[], None] | None = None
+        self.compiling: Callable[[], None] | None = None
+        """While the training compiles, and there is nothing to save yet: a function that prints the
+        last message of a process that ends meanwhile. None: the training saves when it is asked to
+        stop."""
         self._former: dict[int, _Handler] = {}
 
     @property
@@ -59,18 +62,6 @@ class StopRequest(contextlib.AbstractContextManager["StopRequest"]):
     def wait(self, seconds: float) -> bool:
         """Wait for a request for some seconds, and return whether there is one."""
         return self._requested.wait(seconds)
-
-    def begin_compiling(self, say: Callable[[], None]) -> None:
-        """Record that the training compiles, so that there is nothing to save yet.
-
-        Args:
-          say: prints the last message of a process that ends meanwhile.
-        """
-        self._compiling = say
-
-    def begin_training(self) -> None:
-        """Record that the training has compiled: it saves from now on when it is asked to stop."""
-        self._compiling = None
 
     def __exit__(self, *exception: object) -> None:
         """Restore the former handlers."""
@@ -152,7 +143,7 @@ class Preemption(StopRequest):
         if number not in _SIGNALS:
             return
         name = signal.Signals(number).name
-        compiling = self._compiling
+        compiling = self.compiling
         if not self._requested.is_set():
             self._began = time.monotonic()
             self._requested.set()

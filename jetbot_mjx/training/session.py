@@ -7,10 +7,8 @@ receive what they need as required arguments.
 
 import contextlib
 import dataclasses
-import enum
 import functools
 import importlib.util
-import pickle
 import shlex
 import tempfile
 from collections.abc import Callable, Sequence
@@ -21,16 +19,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, UInt32
 
-from jetbot_mjx import runs
+from jetbot_mjx import envs, runs
 from jetbot_mjx.agents import PPO, PolicyParams, TrainState
 from jetbot_mjx.config import Config, ConfigError
-from jetbot_mjx.envs import (
-    BUILT_IN_TASKS,
-    Task,
-    maybe_randomize,
-    open_program_cache,
-    require_trainable,
-)
 from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.evaluation import Evaluator, Summary, summarize, training_keys
 from jetbot_mjx.fallbacks import Fallback, collect
@@ -44,16 +35,6 @@ from jetbot_mjx.training.preemption import DeferredSignals, StopRequest
 from jetbot_mjx.training.run_recorder import RunRecorder, SeedRecorder, Standing, open_sinks
 from jetbot_mjx.training.terminal import open_terminal
 from onekernel import ProgramCache
-
-
-class _Stored(enum.IntEnum):
-    """The content of a run folder when a training begins in it."""
-
-    COMPLETE = 0
-    """A run that has nothing left to train."""
-    NOTHING = 1
-    RESUMABLE = 2
-    """A run with checkpoints, which the training continues."""
 
 
 class Result(NamedTuple):
@@ -157,7 +138,7 @@ def run(
         the CPU is divided otherwise, or the devices have too little memory.
     """
     if programs is None:
-        programs = open_program_cache(config, keep=False)
+        programs = envs.open_program_cache(config, keep=False)
     if programs.loads:
         # Import what writes checkpoints meanwhile; if not, there is time while programs compile.
         from jetbot_mjx.runs import open_manager  # noqa: F401
@@ -200,8 +181,8 @@ def _compose(
     run_dirs = runs.seed_dirs(run_dir, config)
     task_class, task_code = _find_task(config.task.name, run_dirs)
     setup = Setup(config, programs, task_class=task_class)
-    if config.task.name not in BUILT_IN_TASKS:
-        require_trainable(setup.env.task, config)
+    if config.task.name not in envs.BUILT_IN_TASKS:
+        envs.require_trainable(setup.env.task, config)
     ppo = ppo_trainer.build_ppo(setup)
     # Another run's policy is loaded only for a run without checkpoints of its own.
     warm_start = None
@@ -227,7 +208,9 @@ def _has_checkpoints(run_dirs: Sequence[Path]) -> bool:
         return False
 
 
-def _find_task(name: str, run_dirs: Sequence[Path]) -> tuple[type[Task] | None, TaskCode | None]:
+def _find_task(
+    name: str, run_dirs: Sequence[Path]
+) -> tuple[type[envs.Task] | None, TaskCode | None]:
     """Return the class of the run's task if the run stores it, or its source if it is to be stored.
 
     A run that has checkpoints continues with the task that it was begun with. Of several processes,
@@ -236,15 +219,14 @@ def _find_task(name: str, run_dirs: Sequence[Path]) -> tuple[type[Task] | None, 
     primary = distributed.is_primary()
     resumes = primary and _has_checkpoints(run_dirs)
 
-    def source() -> bytes:
-        code = runs.read_task_code(run_dirs[0]) if resumes else runs.collect_task_code(name)
-        return pickle.dumps(code) if code else b""
+    def source() -> TaskCode | None:
+        return runs.read_task_code(run_dirs[0]) if resumes else runs.collect_task_code(name)
 
-    sent = distributed.broadcast_bytes(source) if jax.process_count() > 1 else b""
+    sent = distributed.broadcast_from_primary(source) if jax.process_count() > 1 else None
     task_class = runs.stored_task_class(run_dirs[0], name) if resumes else None
     if sent and not primary:
         with tempfile.TemporaryDirectory() as folder:
-            runs.write_task_code(Path(folder), pickle.loads(sent))
+            runs.write_task_code(Path(folder), sent)
             task_class = runs.stored_task_class(Path(folder), name, silent=True)
     return task_class, None if task_class else runs.collect_task_code(name)
 
@@ -278,7 +260,6 @@ def _train(training: Training, stop: StopRequest) -> Result:
     """Train with the resumable trainer, in all processes."""
     config = training.config
     recorder: RunRecorder | None = None
-    stored: list[TrainState] = []
 
     def say_stopped() -> None:
         text = stop_message(training)
@@ -289,42 +270,37 @@ def _train(training: Training, stop: StopRequest) -> Result:
         clock = stack.enter_context(CompileClock())
         # Several processes end together, after the first checkpoint.
         if jax.process_count() == 1:
-            stop.begin_compiling(say_stopped)
+            stop.compiling = say_stopped
         stack.enter_context(stop)
         seeds = [one.seed for one in config.of_each_seed()]
         trainer = ppo_trainer.CompiledTrainer(training.ppo, seeds, training.setup.programs)
 
-        def begin() -> _Stored:
-            nonlocal recorder, stored
-            resumption, messages = _open_folders(stack, training, trainer.template())
+        template = trainer.template()
+
+        def begin() -> tuple[bool, list[list[np.ndarray]]]:
+            """Return whether the run is complete, and the arrays of the states to resume from."""
+            nonlocal recorder
+            resumption, messages = _open_folders(stack, training, template)
             recorder = stack.enter_context(open_recorder(training, clock, resumption))
-            stored = resumption.states if resumption else []
             if recorder.complete:
                 # Leave out the last message, which would say that the training resumes.
                 for line in (*messages[:-1], _complete_message(config, recorder.standings)):
                     recorder.say(line)
-                return _Stored.COMPLETE
+                return True, []
             if training.warm_start:
                 messages.append(training.warm_start.describe())
             recorder.begin("\n".join([*messages, _headline(training)]))
-            return _Stored.RESUMABLE if resumption else _Stored.NOTHING
+            return False, [jax.tree.leaves(one) for one in resumption.states] if resumption else []
 
         # The first process opens the folders, and sends the others the state to resume from.
-        found = _Stored(distributed.run_on_primary(begin))
-        states = None
-        if found is _Stored.RESUMABLE:
-            states = distributed.broadcast_from_primary(stored, trainer.template(), config.seeds)
-        elif found is _Stored.NOTHING and training.warm_start:
-            states = [training.warm_start.apply(one) for one in trainer.get(trainer.init())]
-        if found is not _Stored.COMPLETE:
-            ppo_trainer.train(
-                trainer,
-                recorder or TrainerCallback(),
-                stop,
-                config.checkpoint_interval,
-                states,
-                resumes=found is _Stored.RESUMABLE,
-            )
+        complete, stored = distributed.broadcast_from_primary(begin)
+        states = [jax.tree.unflatten(jax.tree.structure(template), leaves) for leaves in stored]
+        if not complete:
+            if training.warm_start and not stored:
+                states = [training.warm_start.apply(one) for one in trainer.get(trainer.init())]
+            callback, interval = recorder or TrainerCallback(), config.checkpoint_interval
+            resumes = bool(stored)
+            ppo_trainer.train(trainer, callback, stop, interval, states or None, resumes=resumes)
     # Tell the other processes whether the training came to its end.
     complete = distributed.run_on_primary(lambda: recorder is not None and recorder.complete)
     return _result(training, recorder, finished=bool(complete))
@@ -392,7 +368,7 @@ def _evaluation(setup: Setup) -> Callable[[PolicyParams], Summary]:
     The robots vary as in training.
     """
     env, programs = setup.env, setup.programs
-    evaluator = Evaluator(maybe_randomize(env), setup.networks, programs)
+    evaluator = Evaluator(envs.maybe_randomize(env), setup.networks, programs)
     episodes = setup.config.evaluation.episodes
 
     @functools.cache

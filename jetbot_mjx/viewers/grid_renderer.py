@@ -202,11 +202,9 @@ def camera_above(grid: RobotGrid, fovy: float) -> mujoco.MjvCamera:
       fovy: The field of view [degrees].
     """
     camera = mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
     half = float(np.abs(grid.corners_w).max())
     camera.distance = 1.02 * half / math.tan(math.radians(fovy) / 2)
     camera.azimuth, camera.elevation = 0.0, -90.0
-    camera.lookat[:] = 0.0
     return camera
 
 

@@ -182,7 +182,6 @@ def overview(
     slopes = math.tan(math.radians(fovy) / 2) * np.array([sides, sides, below, above])
     eye_w = eye_that_sees(points_w, axes_w, slopes, _NEAREST)
     camera = mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
     camera.azimuth, camera.elevation = 0.0, _ELEVATION
     # The camera turns around the point nearest to the origin.
     camera.distance = -float(axes_w[2] @ eye_w)

@@ -335,11 +335,8 @@ class EvaluationVideo:
         episodes = self._evaluator.run(params, report_keys(self.GOALS))
         trajectories = split_trajectories(self._env, episodes, range(self.GOALS))
         with VideoRenderer(self._env, self._SIDE, self._FPS) as renderer:
-            frames = list(
-                renderer.render_side_by_side(
-                    [(f"{env_steps:,} steps", one) for one in trajectories]
-                )
-            )
+            headed = [(f"{env_steps:,} steps", one) for one in trajectories]
+            frames = list(renderer.render_side_by_side(headed))
         write_mp4(path, frames, self._FPS)
         write_gif(path.with_suffix(".gif"), frames)
 

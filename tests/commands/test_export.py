@@ -468,7 +468,7 @@ def test_an_export_that_is_stopped_leaves_the_earlier_one(run_dir, exported, sho
     def stop(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(policy_export, "write_json", stop)
+    monkeypatch.setattr(policy_export.runs, "write_json", stop)
     with pytest.raises(KeyboardInterrupt):
         export_policy(run_dir)
     assert (exported / "policy.onnx").is_file()

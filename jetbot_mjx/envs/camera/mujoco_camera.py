@@ -212,24 +212,24 @@ class MujocoCamera(Camera):
             mocap[:, self._mocap_ids[name]] = np.asarray(values, float).reshape(count, 3)
         images = np.empty((count, *self.shape), np.uint8)
         threads = _render_threads()
-        todo: dict[int, list[tuple[int, int]]] = {}
+        todo: dict[int, list[tuple[int, _View]]] = {}
         for i in range(count):
+            view = _View(i % SCENERIES if self._sceneries else i, places[i], axes[i], mocap[i])
             # An ended episode is stepped again from the same state, and looks the same again.
-            key = places[i].tobytes() + axes[i].tobytes() + mocap[i].tobytes()
+            key = b"".join(part.tobytes() for part in view[1:])
             known = self._last.get(i)
             if known is not None and known[0] == key:
                 images[i] = known[1]
             else:
-                number = i % SCENERIES if self._sceneries else i
-                todo.setdefault(number % len(threads), []).append((number, i))
+                todo.setdefault(view.number % len(threads), []).append((i, view))
                 self._last[i] = key, images[i]
 
-        def draw(thread: int, robots: list[tuple[int, int]]) -> None:
+        def draw(thread: int, views: list[tuple[int, _View]]) -> None:
             # In the order of their sceneries, so that each is uploaded once.
-            for number, i in sorted(robots):
-                images[i] = self._draw(thread, number, places[i], axes[i], mocap[i])
+            for i, view in sorted(views, key=lambda one: one[1].number):
+                images[i] = self._draw(thread, view)
 
-        for done in [threads[one].pool.submit(draw, one, robots) for one, robots in todo.items()]:
+        for done in [threads[one].pool.submit(draw, one, views) for one, views in todo.items()]:
             done.result()
         return images.reshape(*batch, *self.shape)
 
@@ -255,18 +255,10 @@ class MujocoCamera(Camera):
         for name, place in mocap_positions.items():
             mocap[self._mocap_ids[name]] = place
         position = np.asarray(position_w, float) + body @ self._mount_position
-        rotation, number = body @ self._mount_rotation, scenery % SCENERIES
-        pool = _render_threads()[0].pool
-        return pool.submit(self._draw, 0, number, position, rotation, mocap).result()
+        view = _View(scenery % SCENERIES, position, body @ self._mount_rotation, mocap)
+        return _render_threads()[0].pool.submit(self._draw, 0, view).result()
 
-    def _draw(
-        self,
-        thread: int,
-        number: int,
-        position: Float[np.ndarray, "3"],
-        rotation: Float[np.ndarray, "3 3"],
-        mocap: Float[np.ndarray, "nmocap 3"],
-    ) -> UInt8[np.ndarray, "h w c"]:
+    def _draw(self, thread: int, view: "_View") -> UInt8[np.ndarray, "h w c"]:
         """Draw one image; only the thread of that number may call it."""
         discarded = _render_threads()[thread].discarded
         while discarded:
@@ -275,12 +267,24 @@ class MujocoCamera(Camera):
             self._stages[thread] = _Stage(copy.copy(self._base))
         stage = self._stages[thread]
         if self._sceneries:
-            stage.set_scenery(number, self._sceneries[number])
-        picture = stage.picture(position, rotation, mocap)
-        image = reduce_picture(picture, self._lens, self.shape[:2])
+            stage.set_scenery(view.number, self._sceneries[view.number])
+        image = reduce_picture(stage.picture(view), self._lens, self.shape[:2])
         if self.config.colour == "grey":
             image = image @ np.array(GREY)[:, None]
         return np.floor(image + 0.5).astype(np.uint8)
+
+
+class _View(NamedTuple):
+    """A `_View` holds what one picture shows."""
+
+    number: int
+    """Number of the scenery, with varied appearance."""
+    position: Float[np.ndarray, "3"]
+    """Optical centre [m], world frame."""
+    rotation: Float[np.ndarray, "3 3"]
+    """Axes of the image (right, down, forward) as columns."""
+    mocap: Float[np.ndarray, "nmocap 3"]
+    """Positions of the mocap bodies [m], world frame."""
 
 
 class _RenderThread(NamedTuple):
@@ -321,22 +325,17 @@ class _Stage:
             self._number = number
             self.renderer.upload(paint(self._model, scenery))
 
-    def picture(
-        self,
-        position: Float[np.ndarray, "3"],
-        rotation: Float[np.ndarray, "3 3"],
-        mocap: Float[np.ndarray, "nmocap 3"],
-    ) -> UInt8[np.ndarray, "H W 3"]:
+    def picture(self, view: _View) -> UInt8[np.ndarray, "H W 3"]:
         """Render a picture."""
         model, data = self._model, self._data
-        data.mocap_pos[:] = mocap
+        data.mocap_pos[:] = view.mocap
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)
         eye = model.ncam - 1
-        data.cam_xpos[eye] = position
+        data.cam_xpos[eye] = view.position
         # MuJoCo's cameras look along their negative z axis.
-        data.cam_xmat[eye] = (rotation * np.array([1.0, -1.0, -1.0])).reshape(-1)
+        data.cam_xmat[eye] = (view.rotation * np.array([1.0, -1.0, -1.0])).reshape(-1)
         self.renderer.update_scene(data, eye)
         return self.renderer.render()
 
