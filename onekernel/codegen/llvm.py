@@ -552,7 +552,7 @@ class ProgramWriter:
         key = value.index, self.writer.label
         if key not in self._again:
             operands = [self._operand(x) for x in value.operands]
-            place = [is_constant(x) for x in value.operands].index(False)
+            place = next(i for i, x in enumerate(value.operands) if not is_constant(x))
             # LLVM would find the equal operation before the loop, and take its value: pass an
             # operand through an instruction that LLVM does not know.
             operand = operands[place]
