@@ -302,12 +302,9 @@ class _Lowered:
 
     @functools.cached_property
     def launch(self) -> Callable[..., list[Array]]:
-        """Return the kernel as a function of flat arguments; it begins to be compiled."""
+        """Return the kernel as a function of flat arguments."""
         assert isinstance(self.one, Kernel)
-        # Compile the kernel in a thread, while XLA compiles the program around it.
-        backend = default_backend()
-        if backend and self.one.impl in ("auto", backend.IMPL) and not backend.obstacle():
-            backend.prepare(self.one)
+        self.one.on_batch = functools.cache(self._prepare)
         launch = self.one.as_function()
         constants = [self.traced.consts[i] for i in self.places]
         arguments = _dtypes(_arguments(self.traced, self.places))
@@ -318,6 +315,14 @@ class _Lowered:
             return _received(launch(passed), self._result_dtypes)
 
         return run
+
+    def _prepare(self) -> None:
+        """Compile the kernel in a thread, while XLA compiles the program around it."""
+        # That is for many instances: around a single one, XLA has little to compile.
+        backend = default_backend()
+        assert isinstance(self.one, Kernel)
+        if backend and self.one.impl in ("auto", backend.IMPL) and not backend.obstacle():
+            backend.prepare(self.one)
 
     def check(self) -> None:
         """Compare the kernel with XLA on random numbers, once.

@@ -84,6 +84,8 @@ class Kernel:
     on_derivative: Callable[[], None] | None = None
     """A function that is called where JAX differentiates the kernel: the derivative of the fallback
     takes its place. None: the kernel cannot be differentiated."""
+    on_batch: Callable[[], None] = lambda: None
+    """A function that is called where `jax.vmap` batches the kernel."""
     before: ScalarProgram | None = None
     """A function from the arguments to those of the first step; None: they are the same."""
     after: ScalarProgram | None = None
@@ -225,7 +227,9 @@ def called_by(equation: JaxprEqn) -> Kernel | None:
     return equation.params["kernel"] if equation.primitive is _kernel_p else None
 
 
-def make_primitive(name: str, static: str) -> Primitive:
+def make_primitive(
+    name: str, static: str, on_batch: Callable[..., None] = lambda parameter: None
+) -> Primitive:
     """Return a primitive of one instance, which `jax.vmap` batches by an axis in front of all.
 
     Its arguments and results are arrays. The caller defines the shapes of its results
@@ -234,6 +238,7 @@ def make_primitive(name: str, static: str) -> Primitive:
     Args:
       name: its name.
       static: the name of its parameter, which is not an array.
+      on_batch: is called with that parameter where `jax.vmap` batches the primitive.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -250,6 +255,7 @@ def make_primitive(name: str, static: str) -> Primitive:
     def batch(
         arrays: Sequence[Array], axes: Sequence[int | None], **parameters: object
     ) -> tuple[list[Array], list[int]]:
+        on_batch(parameters[static])
         # All arguments that have the batch axis agree on its size. Move it to the front of these,
         # and repeat the others along it.
         (size,) = {x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None}
@@ -266,7 +272,7 @@ def make_primitive(name: str, static: str) -> Primitive:
     return primitive
 
 
-_kernel_p = make_primitive("onekernel", "kernel")
+_kernel_p = make_primitive("onekernel", "kernel", on_batch=lambda kernel: kernel.on_batch())
 
 
 def _batch_shape(kernel: Kernel, leaves: Sequence[Array | ShapedArray]) -> tuple[int, ...]:

@@ -2,7 +2,8 @@
 
 On a CPU every scalar of the program is a vector register of, say, 8 numbers. Each place in the
 vector, a lane, runs the whole program for one instance. On a GPU each thread runs it for one
-instance, with plain scalars.
+instance, with plain scalars. So does a CPU for a single instance, with the same instructions in the
+same blocks as for vectors: LLVM then fuses the same products and sums, and the bits are the same.
 
 The lanes of a vector cannot jump on their own. So a loop goes on until it has ended for all lanes.
 A lane that ends earlier keeps its values, and its results do not depend on the other lanes. A side
@@ -92,7 +93,7 @@ def tile_function(
     """
     # `noalias` promises LLVM that no other address reaches this memory, so it may reorder loads and
     # stores.
-    w = LlvmWriter(name, "ptr noalias tile", lanes=lanes)
+    w = LlvmWriter(name, "ptr noalias tile", lanes=lanes, keeps_blocks=lanes == 1)
     (tile,) = w.parameters
 
     def load(row: int) -> Value:
@@ -612,7 +613,7 @@ def _quotient(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
 
 def _extreme(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
     w = on.writer
-    if w.lanes == 1:
+    if on.for_gpu:
         # `llvm.maximum` returns NaN if either operand is NaN, as JAX does. GPUs compute it in one
         # instruction, CPUs do not.
         return w.intrinsic(_EXTREMES[value.op], *operands)

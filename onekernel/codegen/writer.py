@@ -383,6 +383,7 @@ class LlvmWriter:
         lanes: int = 1,
         result: str = "void",
         convention: str = "internal",
+        keeps_blocks: bool = False,
     ) -> None:
         """Begin with the block `entry`.
 
@@ -393,6 +394,7 @@ class LlvmWriter:
           result: the type of the result.
           convention: `internal` for a function that only its own module calls, `external` for one
             that others call, `ptx_kernel` for one that a GPU launches.
+          keeps_blocks: whether to forbid LLVM to compute a selection by a branch around a division.
         """
         self.name, self.lanes, self.result = name, lanes, result
         self.label = "entry"
@@ -403,6 +405,10 @@ class LlvmWriter:
         self._allocations: list[str] = []
         self._lines: list[str | Phi] = []
         self._count = 0
+        self._suffix = ""
+        if keeps_blocks:
+            self.declare("!0 = !{}")
+            self._suffix = ", !unpredictable !0"
         # The last word of a parameter is its name, the first one its type.
         given = [text.rpartition(" ")[::2] for text in parameters]
         self.parameters = [Value(self, f"%{name}", _parameter_type(kind)) for kind, name in given]
@@ -475,7 +481,8 @@ class LlvmWriter:
     def select(self, condition: Value, yes: Value | Number, no: Value | Number) -> Value:
         """Return one of two values, of which at least one is no constant of Python."""
         one, other = self._alike(yes, no)
-        return self.let(f"select {condition.typed}, {one.typed}, {other.typed}", one.type)
+        operands = f"{condition.typed}, {one.typed}, {other.typed}"
+        return self.let(f"select {operands}{self._suffix}", one.type)
 
     def minimum(self, one: Value | Number, other: Value | Number) -> Value:
         """Return the smaller of two numbers; the second if either is NaN."""

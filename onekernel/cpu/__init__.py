@@ -86,25 +86,44 @@ def obstacle() -> str | None:
     return probe(launch, device, instances=2 * host.lanes + 1)
 
 
-def kernel_text(kernel: Kernel) -> str:
-    """Write a kernel as LLVM IR for this processor.
+def kernel_text(kernel: Kernel, instances: int | None = None) -> str:
+    """Return a kernel as LLVM IR for this processor.
 
     Args:
       kernel: the kernel.
+      instances: the number of instances; None: many.
 
     Returns:
-      The text of a module.
+      The text of a module, which is written on first use.
 
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction.
     """
     host = host_processor()
-    return xla_call.kernel_text(kernel, lanes=host.lanes, machine=host.machine)
+    # With a table, the lanes are items, of which there are many.
+    lanes = host.lanes
+    if instances is not None and kernel.table is None:
+        lanes = lanes_for(instances)
+    write = functools.partial(xla_call.kernel_text, kernel, lanes=lanes, machine=host.machine)
+    return kernel.text(f"{IMPL} {lanes}", write)
+
+
+def lanes_for(instances: int) -> int:
+    """Return how many instances a kernel steps side by side, if there are so many in all.
+
+    A lane without an instance costs as much as one that has one: wider vectors have slower
+    divisions, roots and memory, and a single instance needs no masks and no vectors in its arrays.
+    So the lanes are the fewest that hold all instances. The bits of an instance are the same in
+    any number of lanes, because LLVM finds the same instructions in the same blocks, in which it
+    looks for products and sums to fuse.
+    """
+    most = host_processor().lanes
+    return next((lanes for lanes in (1, 4, 8) if instances <= lanes < most), most)
 
 
 def prepare(kernel: Kernel) -> None:
     """Begin to compile a kernel, as specified by `onekernel.kernel.Backend`."""
-    in_background(lambda: registered(kernel.text(IMPL, lambda: kernel_text(kernel))))
+    in_background(lambda: registered(kernel_text(kernel)))
 
 
 def inspect(kernel: Kernel) -> Compiled:
@@ -128,8 +147,8 @@ def inspect(kernel: Kernel) -> Compiled:
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `onekernel.kernel.Backend`."""
-    text = kernel.text(IMPL, lambda: kernel_text(kernel))
-    return launch_text(text, leaves, kernel.results(leaves[0].shape[0]))
+    instances = leaves[0].shape[0]
+    return launch_text(kernel_text(kernel, instances), leaves, kernel.results(instances))
 
 
 def launch_text(

@@ -615,7 +615,7 @@ def _simplify_not(graph: ExprGraph, dtype: np.dtype, x: Expr) -> Scalar | None:
     return graph.apply("xor", x, cast(Constant, np.array(-1).astype(dtype)[()]))
 
 
-SIMPLE_POWERS = {1.0, 2.0, 0.5}
+SIMPLE_POWERS = {1.0, 2.0, 0.5, 1.5}
 """Exponents for which no logarithm is needed."""
 
 
@@ -627,6 +627,9 @@ def _simplify_pow(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
     if _equals(y, -0.5):
         # The derivative of a root.
         return graph.apply("div", dtype.type(1), graph.apply("sqrt", x))
+    if _equals(y, 1.5):
+        # The distance to the third power, of its square.
+        return graph.apply("mul", x, graph.apply("sqrt", x))
     return graph.apply("sqrt", x) if _equals(y, 0.5) else None
 
 

@@ -19,7 +19,7 @@ from jetbot_mjx.envs import program_key
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.errors import UserError
-from onekernel import cpu, kernel
+from onekernel import cpu, fuse, kernel
 from onekernel.cpu import xla_call
 from onekernel.lower.jaxpr import scalarize
 
@@ -129,6 +129,61 @@ def test_a_robots_bits_do_not_depend_on_those_beside_it(driven):
     others = np.delete(np.arange(1000), 3)
     assert not np.isfinite(spoilt.qpos[3]).any()
     np.testing.assert_array_equal(spoilt.qpos[others], together.qpos[others])
+
+
+def divided(x):
+    """A product and a sum around a selection, for whose division LLVM would make a branch."""
+    a, b, p, q, r = x
+    product = a * b
+    return product + jnp.where(r < a, p / q, r)
+
+
+def looked_up(x):
+    """A loop that ends for each instance by itself, and reads an array and a table."""
+    table = jnp.asarray(np.random.default_rng(1).normal(size=300), jnp.float32)
+
+    def again(state):
+        y, place, count = state
+        y = y * 0.75 + table[place] * jnp.sin(x[place % 5]) + jnp.exp(-y * y) / (2 + y * y)
+        return y, (place * 7 + jnp.int32(y * 10)) % 300, count + 1
+
+    start = x[0], jnp.int32(4), jnp.int32(0)
+    return jax.lax.while_loop(lambda s: (s[0] < 1) & (s[2] < 20), again, start)
+
+
+def kept(x):
+    """A scan that returns the number of every step."""
+    return jax.lax.scan(lambda y, _: (y - 0.1 * y * jnp.tanh(y) * x[1], y), x[0], length=70)[1]
+
+
+ALONE = {
+    "a selection": divided,
+    "an array": looked_up,
+    "a scan": kept,
+    "a sort": jnp.sort,
+    "extremes": lambda x: (jnp.maximum(x * 0, -x * 0), jnp.minimum(-x * 0, x * 0)),
+}
+
+
+@needs_it
+@pytest.mark.parametrize("instances", [1, 3, 8, 9])
+@pytest.mark.parametrize("name", ALONE)
+def test_an_instances_bits_do_not_depend_on_how_many_there_are(name, instances):
+    one = jax.vmap(fuse(ALONE[name], on_unsupported="raise"))
+    drawn = np.float32(np.random.default_rng(0).normal(size=(256 // instances, instances, 5)))
+    alone = jax.jit(lambda x: jax.lax.map(one, x))(drawn)
+    together = jax.jit(one)(drawn.reshape(-1, 5))
+    for few, many in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
+        words = np.asarray(few).view(np.uint32)
+        np.testing.assert_array_equal(words.reshape(many.shape), np.asarray(many).view(np.uint32))
+
+
+@needs_it
+def test_few_instances_have_few_lanes():
+    most = cpu.host_processor().lanes
+    assert [cpu.lanes_for(n) for n in (1, 2, 4, most, 1000)] == [1, 4, 4, most, most]
+    text = cpu.kernel_text(kernel_of(lambda x: x + 1, jnp.zeros(()), steps=1), instances=1)
+    assert "x float>" not in text
 
 
 @needs_it

@@ -164,6 +164,7 @@ FUNCTIONS = {
         jnp.square(x),
         jax.lax.rsqrt(x * x),
         x**2.0,
+        jnp.abs(x) ** 1.5,
     ),
     "angles": lambda x: (jnp.sin(9 * x), jnp.cos(9 * x), jnp.arctan2(x, x[::-1]), jnp.floor(x)),
     "whole numbers": lambda x: ((x > 0).astype(jnp.int32) * 3 + 1, (x * 3).astype(jnp.int32)),
