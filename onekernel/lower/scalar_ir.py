@@ -624,13 +624,19 @@ def _simplify_pow(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
         return x
     if _equals(y, 2):
         return graph.apply("mul", x, x)
+    if not any(_equals(y, power) for power in (0.5, -0.5, 1.5)):
+        return None
+    root, factor = graph.apply("sqrt", x), x
+    if not graph.finite:
+        # By convention, powers of -inf that are no whole numbers are those of inf.
+        is_lowest = graph.apply("eq", x, dtype.type(-np.inf))
+        root = graph.select(is_lowest, root, dtype.type(np.inf))
+        factor = graph.apply("abs", x)
     if _equals(y, -0.5):
         # The derivative of a root.
-        return graph.apply("div", dtype.type(1), graph.apply("sqrt", x))
-    if _equals(y, 1.5):
-        # The distance to the third power, of its square.
-        return graph.apply("mul", x, graph.apply("sqrt", x))
-    return graph.apply("sqrt", x) if _equals(y, 0.5) else None
+        return graph.apply("div", dtype.type(1), root)
+    # To the power of 1.5: of the square of a distance, its third power.
+    return root if _equals(y, 0.5) else graph.apply("mul", factor, root)
 
 
 def _simplify_sign(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:

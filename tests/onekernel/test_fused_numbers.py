@@ -144,3 +144,10 @@ def test_a_kernel_for_several_robots_stays_as_it_is():
     robots = np.random.default_rng(0).normal(size=(4, 2, 3)).astype(np.float32)
     ours = jax.jit(jax.vmap(fuse(each, on_unsupported="xla")))(robots)
     np.testing.assert_allclose(ours, robots * 4, rtol=1e-6)
+
+
+@pytest.mark.parametrize("power", [0.5, -0.5, 1.5])
+def test_powers_of_infinities_are_those_of_jax(power):
+    x = jnp.array([-jnp.inf, -2.0, 0.0, 3.0, jnp.inf, jnp.nan])
+    ours = jax.jit(jax.vmap(fuse(lambda x: x**power)))(x)
+    np.testing.assert_allclose(ours, jax.jit(lambda x: x**power)(x), rtol=1e-6)
