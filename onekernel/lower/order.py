@@ -2,7 +2,7 @@
 
 A processor has registers for some dozens of numbers. What waits longer is spilled to memory, and
 loaded again when it is used. In the order in which JAX records a function, an array is computed
-completely before anything uses it; for a step of a robot, these are hundreds of numbers. LLVM
+completely before anything uses it, and its numbers wait: hundreds of them in a simulation. LLVM
 changes that order within narrow limits.
 
 Here a list scheduler chooses the operations of a block one after the other. Of those whose operands
@@ -166,8 +166,9 @@ def _indices(scalars: Iterable[Scalar]) -> Iterator[int]:
     """Yield the indices of the operations, loops and branches that compute some scalars."""
     for x in scalars:
         if not is_constant(x):
-            is_afterwards = x.op in ("result", "stack") and x.owner is not None
-            yield x.owner.index if is_afterwards else x.index
+            computed_by = x.owner if x.op in ("result", "stack") else x
+            assert computed_by is not None
+            yield computed_by.index
 
 
 def _taken(item: Item) -> Iterator[Scalar]:
