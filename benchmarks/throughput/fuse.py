@@ -12,7 +12,9 @@
 All make the same environment steps: `--n-substeps` physics steps under constant controls, which are
 drawn before the timing starts, from the same states. Each call begins again from these states, in
 which the instances have moved under random controls for up to a hundred physics steps. The
-contenders are timed in turn in every round. The last columns say how far the positions and
+contenders are timed in turn in every round. `cpu/step` is the processor time of all threads for an
+environment step of one instance: where other programs run beside the benchmark, compare the
+contenders for CPUs by it. The last columns say how far the positions and
 velocities after one environment step are from those of C MuJoCo in double precision, whose solver
 may make 1,000 iterations, and from those of MJX, relative to the largest of them.
 
@@ -114,6 +116,9 @@ class Row(NamedTuple):
     num_envs: int
     env_steps_per_second: float | None
     """Median of the rounds; None: it did not compile within the limit."""
+    cpu_seconds: float | None
+    """Processor time of all threads for one environment step of one instance, the median of the
+    rounds [s]; other programs on the machine change it little."""
     compile_seconds: float | None
     """Time of tracing, lowering and compiling [s]; C MuJoCo has none."""
     repeats: list[float]
@@ -177,14 +182,23 @@ class Problem:
         return made.replace(**arrays)
 
 
+class Round(NamedTuple):
+    """A `Round` holds what one round took."""
+
+    env_steps_per_second: float
+    """The rate, summed over the instances."""
+    cpu_seconds: float
+    """Processor time of all threads for one environment step of one instance [s]."""
+
+
 class Contender(Protocol):
     """A `Contender` steps the instances of a problem in its own way."""
 
     num_envs: int
     compile_seconds: float | None
 
-    def repeat(self) -> float:
-        """Return the environment steps per second of one round, summed over the instances."""
+    def repeat(self) -> Round:
+        """Time one round."""
         ...
 
 
@@ -213,9 +227,9 @@ class Compiled:
         self.compile_seconds: float | None = time.perf_counter() - start
         self._calls = warm_up(self._time_calls)
 
-    def repeat(self) -> float:
-        """Return the environment steps per second of one round, summed over the instances."""
-        return self.num_envs * self._unroll * self._calls / self._time_calls(self._calls)
+    def repeat(self) -> Round:
+        """Time one round."""
+        return _round(self._time_calls, self._calls, self.num_envs * self._unroll)
 
     def moved(self) -> Moved:
         """Return the first distinct instances after one environment step."""
@@ -227,6 +241,14 @@ class Compiled:
         for _ in range(calls):
             jax.block_until_ready(self._program(self._states, self._controls))
         return time.perf_counter() - start
+
+
+def _round(time_calls: Callable[[int], float], calls: int, env_steps: int) -> Round:
+    """Time some calls, each of which makes so many environment steps of an instance."""
+    before = time.process_time()
+    seconds = time_calls(calls)
+    cpu_seconds = time.process_time() - before
+    return Round(env_steps * calls / seconds, cpu_seconds / (env_steps * calls))
 
 
 def _by_kernel(problem: Problem, step: FusedMjx) -> Compiled:
@@ -310,8 +332,8 @@ class InOtherProcess:
             self.close()
             raise
 
-    def repeat(self) -> float:
-        """Return the environment steps per second of one round, summed over the instances."""
+    def repeat(self) -> Round:
+        """Time one round."""
         return self._ask("repeat")
 
     def moved(self) -> Moved:
@@ -371,9 +393,9 @@ class Mujoco:
         self._roll = self._batch(problem) if is_batch else self._rollout(problem)
         self._calls = warm_up(self._time_calls)
 
-    def repeat(self) -> float:
-        """Return the environment steps per second of one round, summed over the instances."""
-        return self.num_envs * self._unroll * self._calls / self._time_calls(self._calls)
+    def repeat(self) -> Round:
+        """Time one round."""
+        return _round(self._time_calls, self._calls, self.num_envs * self._unroll)
 
     def _rollout(self, problem: Problem) -> Callable[[], object]:
         """Return a call of `mujoco.rollout`."""
@@ -507,29 +529,43 @@ def measure(settings: Settings, rounds: int, xla_limit: float) -> Iterator[Row]:
             except TimeoutError as error:
                 notes[name] = str(error)
         contenders |= compiled
-        repeats: dict[str, list[float]] = {name: [] for name in contenders}
+        repeats: dict[str, list[Round]] = {name: [] for name in contenders}
         for _ in range(rounds):
             for name, contender in contenders.items():
                 repeats[name].append(contender.repeat())
         moved = {name: contender.moved() for name, contender in compiled.items()}
     reference = converged(problem)
     for name in notes:
-        contender = contenders.get(name)
         from_mujoco = difference(moved[name], reference) if name in moved else None
         both = name == "kernel" and {"kernel", "mjx"} <= moved.keys()
         from_mjx = difference(moved["kernel"], moved["mjx"]) if both else None
-        yield Row(
-            settings.name,
-            problem.model.nv,
-            name,
-            settings.num_envs if contender is None else contender.num_envs,
-            None if contender is None else statistics.median(repeats[name]),
-            None if contender is None else contender.compile_seconds,
-            repeats.get(name, []),
-            from_mujoco,
-            from_mjx,
-            notes[name],
-        )
+        contender, timed = contenders.get(name), repeats.get(name, [])
+        differences = from_mujoco, from_mjx
+        yield _row(problem, name, contender, timed, differences, notes[name])
+
+
+def _row(
+    problem: Problem,
+    name: str,
+    contender: Contender | None,
+    timed: Sequence[Round],
+    differences: tuple[float | None, float | None],
+    note: str,
+) -> Row:
+    """Return the row of a contender; None: it cannot make a step here."""
+    rates = [x.env_steps_per_second for x in timed]
+    return Row(
+        problem.settings.name,
+        problem.model.nv,
+        name,
+        problem.settings.num_envs if contender is None else contender.num_envs,
+        statistics.median(rates) if rates else None,
+        statistics.median(x.cpu_seconds for x in timed) if timed else None,
+        None if contender is None else contender.compile_seconds,
+        rates,
+        *differences,
+        note,
+    )
 
 
 def _no_warp() -> str:
@@ -541,7 +577,7 @@ def _no_warp() -> str:
 
 _HEAD = (
     f"{'model':26}{'nv':>4} {'contender':10}{'num_envs':>9}{'env steps/s':>13}"
-    f"{'min .. max':>19}{'compile':>10}{'from mujoco':>13}{'from mjx':>10}"
+    f"{'min .. max':>19}{'cpu/step':>13}{'compile':>10}{'from mujoco':>13}{'from mjx':>10}"
 )
 
 
@@ -551,14 +587,16 @@ def table_line(row: Row) -> str:
     def text(x: float | None, form: str) -> str:
         return "" if x is None else format(x, form)
 
-    rate, spread = "-", ""
+    rate, spread, cpu = "-", "", ""
+    if row.cpu_seconds is not None:
+        cpu = f"{1e6 * row.cpu_seconds:.4g} µs"
     if row.env_steps_per_second is not None:
         rate = format_count(row.env_steps_per_second, 4)
         spread = format_spread(row.env_steps_per_second, row.repeats)
     seconds = "" if row.compile_seconds is None else f"{row.compile_seconds:.1f} s"
     return (
         f"{row.model:26}{row.nv:4} {row.contender:10}{row.num_envs:9,}{rate:>13}{spread:>19}"
-        f"{seconds:>10}{text(row.from_mujoco, '.0e'):>13}{text(row.from_mjx, '.0e'):>10}"
+        f"{cpu:>13}{seconds:>10}{text(row.from_mujoco, '.0e'):>13}{text(row.from_mjx, '.0e'):>10}"
         f"{'  ' + row.note if row.note else ''}"
     )
 

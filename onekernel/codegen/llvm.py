@@ -40,6 +40,7 @@ from onekernel.lower import (
     is_constant,
     is_table,
     length_of,
+    ordered,
     recomputable,
 )
 
@@ -99,6 +100,7 @@ def tile_function(
     def load(row: int) -> Value:
         return tile.at(row, w.vector).load(w.vector, align=4 * lanes)
 
+    program = ordered(program)
     # An argument that goes to an array is loaded when it is stored there: of thousands of them, few
     # wait in registers. One that is a result, too, must be loaded before results replace it.
     body = ProgramWriter(w, program)

@@ -3,6 +3,7 @@ from .jaxpr import ScalarProgram as ScalarProgram
 from .jaxpr import scalarize as scalarize
 from .jaxpr import scalarize_part as scalarize_part
 from .linear_algebra import unroll_linear_algebra as unroll_linear_algebra
+from .order import ordered as ordered
 from .scalar_ir import COMPARISONS as COMPARISONS
 from .scalar_ir import Expr as Expr
 from .scalar_ir import Scalar as Scalar
