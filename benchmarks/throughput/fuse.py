@@ -56,6 +56,7 @@ from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.plots import theme, to_png
 from jetbot_mjx.runs.run_dir import versions, write_bytes
+from onekernel import UnsupportedError
 from onekernel.mujoco import FusedMjx, MjxState, fuse_mjx
 
 GYMNASIUM = (
@@ -76,6 +77,8 @@ INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     "RK4": mujoco.mjtIntegrator.mjINT_RK4,
 }
+
+SOLVERS = {"CG": mujoco.mjtSolver.mjSOL_CG, "Newton": mujoco.mjtSolver.mjSOL_NEWTON}
 
 _DISTINCT = 1024
 """Most states that are different from each other; more instances begin from copies of them."""
@@ -502,27 +505,23 @@ def measure(settings: Settings, rounds: int, xla_limit: float) -> Iterator[Row]:
       One row for each contender.
     """
     problem = Problem(settings)
-    step = fuse_mjx(problem.model, settings.n_substeps, on_unsupported="xla")
-    notes = {
-        "kernel": step.obstacle or "",
-        "mjx": "",
-        "warp": _no_warp(),
-        "rollout": "",
-        "batch": "",
-    }
+    notes = dict.fromkeys(("kernel", "mjx", "warp", "rollout", "batch"), "")
     contenders: dict[str, Contender] = {
         "rollout": Mujoco(problem, is_batch=False),
         "batch": Mujoco(problem, is_batch=True),
     }
-    compiled: dict[str, Compiled | InOtherProcess] = {}
-    if not notes["kernel"]:
-        compiled["kernel"] = _by_kernel(problem, step)
     with contextlib.ExitStack() as stack:
-        for name in ("mjx", "warp"):
+        compiled: dict[str, Compiled | InOtherProcess] = {}
+        try:
+            step = fuse_mjx(problem.model, settings.n_substeps, on_unsupported="xla")
+            notes |= {"kernel": step.obstacle or "", "warp": _no_warp()}
             if not xla_limit:
-                notes[name] = "left out"
-            if notes[name]:
-                continue
+                notes |= {"mjx": "left out", "warp": "left out"}
+            if not notes["kernel"]:
+                compiled["kernel"] = _by_kernel(problem, step)
+        except UnsupportedError as error:
+            notes |= dict.fromkeys(("kernel", "mjx", "warp"), str(error))
+        for name in [name for name in ("mjx", "warp") if not notes[name]]:
             try:
                 compiled[name] = other = InOtherProcess(name, settings, xla_limit)
                 stack.callback(other.close)
@@ -647,6 +646,7 @@ def _parser() -> cli.Parser:
     positive = cli.positive_int
     parser.add_argument("--num-envs", type=positive, help="instances (default: 65,536, CPU: 1,024)")
     parser.add_argument("--integrator", choices=("own", *INTEGRATORS), default="own")
+    parser.add_argument("--solver", choices=("own", *SOLVERS), default="own")
     parser.add_argument("--iterations", type=positive, help="most iterations of the solver")
     parser.add_argument("--ls-iterations", type=positive, help="most of each line search")
     parser.add_argument("--tolerance", type=float, help="improvement at which the solver stops")
@@ -680,6 +680,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise UserError(f"--xla-limit {options.xla_limit}: name a number of seconds, or 0")
     solver = {name: getattr(options, name) for name in ("iterations", "ls_iterations", "tolerance")}
     solver = {name: value for name, value in solver.items() if value is not None}
+    if options.solver != "own":
+        solver["solver"] = int(SOLVERS[options.solver])
     if not 0 <= solver.get("tolerance", 0) < 1:
         raise UserError(f"--tolerance {options.tolerance}: name a number from 0 to 1, such as 1e-6")
     if options.output:
