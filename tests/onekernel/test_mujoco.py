@@ -19,7 +19,8 @@ from helpers.small_models import (
     BUTTON,
     CART_POLE,
     HOPPER,
-    STATE,
+    batch_of,
+    by_mjx,
     c_steps,
     chain,
     difference,
@@ -51,27 +52,6 @@ SENSES = """
 </mujoco>
 """
 """A leg whose foot touches the floor at some angles, with sensors."""
-
-
-def batch_of(step, states):
-    """The states of several instances, from their fields."""
-    made = jax.vmap(step.init)(states["qpos"], states["qvel"])
-    return made.replace(**{name: jnp.asarray(x) for name, x in states.items()})
-
-
-def by_mjx(step, states, ctrl):
-    """The fields after one physics step of `mjx.step`, which XLA compiles."""
-
-    def one(state, ctrl):
-        with jax.default_matmul_precision("highest"):
-            return step.from_data(mjx.step(step.model, step.to_data(state, ctrl)))
-
-    # On a CPU: on a GPU, XLA's sums differ by 3e-6 from those that it and the kernel find here.
-    # Compile in a third of the time: the test makes one step only.
-    options = {"xla_backend_optimization_level": 0}
-    states, ctrl = jax.device_put((states, ctrl), jax.devices("cpu")[0])
-    after = jax.jit(jax.vmap(one), compiler_options=options)(states, ctrl)
-    return {name: np.asarray(getattr(after, name)) for name in STATE}
 
 
 def compared(model, *, with_mjx=False, n_substeps=1):
