@@ -77,7 +77,7 @@ class Control(Operations):
     def _results_of(self, text, do, likes):
         together = self._names = self._names + 1
         self._block.lines.append((together, text, do))
-        self.text.append(f"{'  ' * self._depth}{together} = {text}")
+        self._write(together, f"{together} = {text}")
         for i, like in enumerate(likes):
             self._controlled.add(self._names + 1)
             self._line(
@@ -93,7 +93,7 @@ class Control(Operations):
     def _while(self):
         first, inside = self._carries()
         trips = self._scalar("i")
-        self.text.append(f"{'  ' * self._depth}while of {[t.name for t in inside]}:")
+        self._write(None, f"while of {[t.name for t in inside]}:")
         body, ends = self._loop_body(inside)
         outer = self._inside(inside, self._whole(0, 2))
         going = self._scalar("b")
@@ -210,7 +210,7 @@ class Control(Operations):
         which = self._scalar("b" if cases == 2 else "i")
         sides = []
         for _ in range(cases):
-            self.text.append(f"{'  ' * self._depth}case of {which.name}:")
+            self._write(None, f"case of {which.name}:")
             outer = self._inside([], self._whole(1, 6))
             ends = self._ends(likes)
             sides.append((self._leave(outer), ends))
@@ -273,7 +273,7 @@ class Control(Operations):
         x = self._any("f") if not axes else self._of("f", [(3,), (2, 3)][axes - 1])
         x = x if not x.exact else self._rounded(x)
         one = dataclasses.replace(x, name=self._name(), shape=x.shape[axes:])
-        self.text.append(f"{'  ' * self._depth}{name} of {one.name}:")
+        self._write(None, f"{name} of {one.name}:")
         was_in_map, self._in_map = self._in_map, self._in_map or axes > 0
         outer = self._inside([one], self._whole(1, 4))
         like = self._like("ffiu")

@@ -3,12 +3,14 @@
 `random_terms` says which numbers there are, `random_operations` and `random_control` which lines.
 """
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from helpers.random_control import Control
-from helpers.random_terms import BITS, DTYPES, SHAKE, Term
+from helpers.random_terms import BITS, DTYPES, SHAKE, Block, Term
 
 LARGEST = 4.0
 
@@ -31,14 +33,12 @@ class RandomFunction(Control):
 
     The results are exact, but for those below "inexact": dictionaries of vectors by the kind of
     their numbers, of size 0 where there is no such number, beside whole arrays and a key.
-
-    Attributes:
-      text: its lines, to be read.
     """
 
-    def __init__(self, seed, size=12):
+    def __init__(self, seed, size=8):
         arguments, self._structure = jax.tree.flatten(ARGUMENTS)
         super().__init__(seed, arguments)
+        self._dropped = frozenset()
         self._controlled = set()
         self._add_lines(size)
         terms = self._block.terms[len(arguments) :]
@@ -52,7 +52,7 @@ class RandomFunction(Control):
 
         Args:
           arguments: a tree like `ARGUMENTS`.
-          shake: by how much each inexact number is multiplied, less 1, (lines,); None: by nothing.
+          shake: by how much each inexact number is multiplied, less 1, (shakes,); None: by nothing.
         """
         leaves = self._structure.flatten_up_to(arguments)
         known = {x.name: leaf for x, leaf in zip(self._arguments, leaves, strict=True)}
@@ -66,9 +66,39 @@ class RandomFunction(Control):
         }
 
     @property
-    def lines(self):
+    def shakes(self):
         """How many numbers `shake` has."""
         return self._names + 1
+
+    @property
+    def lines(self):
+        """Names of the lines that are neither in a branch or loop nor dropped, in their order."""
+        return [name for name, *_ in self._block.lines if name not in self._dropped]
+
+    @property
+    def text(self):
+        """The lines, to be read: those of a branch or loop before the line that runs it."""
+        text, inside = [], []
+        for name, line in self._text:
+            inside.append(line)
+            if not line.startswith(" ") and name is not None:
+                text += inside if name not in self._dropped else []
+                inside = []
+        return "\n".join(text)
+
+    def without(self, name):
+        """Return the function with nothing in the place of a line: zeros, or no loop or branch."""
+        smaller = copy.copy(self)
+        smaller._dropped = self._dropped | {name}
+        likes = {t.name: t for t in self._block.terms if t.kind != "k"}
+
+        def nothing(known):
+            like = likes.get(name)
+            return None if like is None else jnp.zeros(like.shape, DTYPES[like.kind])
+
+        lines = [(n, text, nothing if n == name else do) for n, text, do in self._block.lines]
+        smaller._block = Block(self._block.terms, lines)
+        return smaller
 
     @property
     def is_exact(self):

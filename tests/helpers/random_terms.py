@@ -73,7 +73,7 @@ class RandomLines:
         self._names = SHAKE
         self._depth = 0
         self._in_map = False
-        self.text = []
+        self._text = []
         self._arguments = [dataclasses.replace(x, name=self._name()) for x in arguments]
         self._block = Block([*self._arguments])
 
@@ -107,8 +107,12 @@ class RandomLines:
         self._block.lines.append((term.name, text, run))
         self._block.terms.append(term)
         size = "" if exact else " inexact"
-        self.text.append(f"{'  ' * self._depth}{term.name}: {kind}{list(shape)}{size} = {text}")
+        self._write(term.name, f"{term.name}: {kind}{list(shape)}{size} = {text}")
         return term
+
+    def _write(self, name, text):
+        """Write down a line, or with None for a name the head of lines that follow."""
+        self._text.append((name, "  " * self._depth + text))
 
     def _rounded(self, term):
         return self._line(
