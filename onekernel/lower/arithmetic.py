@@ -19,7 +19,7 @@ from onekernel.lower.indexing import (
     scalar_array,
     shape_of,
 )
-from onekernel.lower.random_rules import Key, like, words_of
+from onekernel.lower.random_rules import select
 from onekernel.lower.scalar_ir import ExprGraph, Scalar
 
 _FLOAT, _INT = np.dtype(np.float32), np.dtype(np.int32)
@@ -48,15 +48,7 @@ def where(
         condition.reshape((*condition.shape, *trailing)), if_false, if_true
     )
     rows = zip(*(array.ravel() for array in arrays), strict=True)
-    return scalar_array((_select(graph, *row) for row in rows), if_false.shape)
-
-
-def _select(
-    graph: ExprGraph, condition: Scalar, if_false: Scalar | Key, if_true: Scalar | Key
-) -> Scalar | Key:
-    """Select between two scalars, or the words of two random keys."""
-    pairs = zip(words_of(if_false), words_of(if_true), strict=True)
-    return like(if_true, (graph.select(condition, *pair) for pair in pairs))
+    return scalar_array((select(graph, *row) for row in rows), if_false.shape)
 
 
 def fold(graph: ExprGraph, op: str, initial: Scalar, scalars: Iterable[Scalar]) -> Scalar:

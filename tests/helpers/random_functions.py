@@ -72,8 +72,9 @@ class RandomFunction(Control):
 
     @property
     def lines(self):
-        """Names of the lines that are neither in a branch or loop nor dropped, in their order."""
-        return [name for name, *_ in self._block.lines if name not in self._dropped]
+        """Names of the lines that `without` may drop: none in a branch or loop, and no keys."""
+        keys = {t.name for t in self._block.terms if t.kind == "k"}
+        return [name for name, *_ in self._block.lines if name not in self._dropped | keys]
 
     @property
     def text(self):
@@ -94,7 +95,8 @@ class RandomFunction(Control):
 
         def nothing(known):
             like = likes.get(name)
-            return None if like is None else jnp.zeros(like.shape, DTYPES[like.kind])
+            # Of no results, none can be looked up.
+            return {} if like is None else jnp.zeros(like.shape, DTYPES[like.kind])
 
         lines = [(n, text, nothing if n == name else do) for n, text, do in self._block.lines]
         smaller._block = Block(self._block.terms, lines)

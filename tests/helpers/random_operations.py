@@ -213,9 +213,10 @@ class Operations(RandomLines):
         shape = self._draw(SHAPES)
         i, where = self._scalar("i"), self._whole(0, 1)
         draw = jax.random
+        splits = (lambda k, p, n: draw.split(k)[1]), (lambda k, p, n: draw.split(k, 3)[n])
         # Kind, bound, bits behind the point, whether it is exact, shape, and the numbers.
         forms = {
-            "split": ("k", 0, 0, True, (), lambda k, p, n: draw.split(k)[where]),
+            "split": ("k", 0, 0, True, (), splits[where]),
             "fold in": ("k", 0, 0, True, (), lambda k, p, n: draw.fold_in(k, n)),
             "bits": ("u", 0, 0, True, shape, lambda k, p, n: draw.bits(k, shape)),
             "uniform": ("f", 1, 23, True, shape, lambda k, p, n: draw.uniform(k, shape)),

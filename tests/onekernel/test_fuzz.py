@@ -15,10 +15,10 @@ from onekernel.lower import control_flow
 if cpu.obstacle():
     pytest.skip("llvmlite compiles nothing here", allow_module_level=True)
 
-QUICK = 12
+QUICK = 16
 BATCH = 24  # functions in one test of the slow suite
 BATCHES = 100
-REGRESSIONS = (12, 14, 33, 62, 110, 236)
+REGRESSIONS = (33, 62, 110, 236, 689, 972)
 """Seeds of functions that once had no kernel, or of which XLA has two results."""
 
 STAGES = 5
