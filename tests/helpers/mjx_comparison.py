@@ -95,4 +95,4 @@ def _with_shaken(rng, x):
 def _distance(some, others):
     """Return the largest difference, relative to the largest number of all instances."""
     largest = np.abs(np.float64(others)).max(initial=1e-12)
-    return np.abs(np.float64(some) - others).max(initial=0) / largest
+    return float(np.abs(np.float64(some) - others).max(initial=0) / largest)
