@@ -55,7 +55,7 @@ def check(kernel: Kernel, arguments: Sequence[np.dtype], results: Sequence[np.dt
             _run(by_xla, [_shaken(random, x) for x in drawn], results) for _ in range(_SHAKES)
         ]
     for place, (one, other) in enumerate(zip(ours, theirs, strict=True)):
-        wrong = _differ(one, other, [x[place] for x in shaken])
+        wrong = differ(one, other, [x[place] for x in shaken])
         if wrong.any():
             # Name the worst instance, and what it returned.
             i = int(np.argmax(wrong.reshape(_INSTANCES, -1).any(axis=1)))
@@ -96,8 +96,17 @@ def _run(
     return [x != 0 if dtype.kind == "b" else x for x, dtype in found]
 
 
-def _differ(one: np.ndarray, other: np.ndarray, shaken: Sequence[np.ndarray]) -> np.ndarray:
-    """Return which numbers differ by more than round-off, as an array of truth values."""
+def differ(one: np.ndarray, other: np.ndarray, shaken: Sequence[np.ndarray]) -> np.ndarray:
+    """Return which numbers differ by more than round-off.
+
+    Args:
+      one: a result of several instances, (instances, ...).
+      other: what it should be.
+      shaken: the same as `other`, each computed from other shaken numbers.
+
+    Returns:
+      Truth values of the shape of `one`.
+    """
     if one.dtype.kind != "f":
         # What the shaking changes may go either way.
         steady = np.all([x == other for x in shaken], axis=0)

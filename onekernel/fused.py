@@ -252,7 +252,9 @@ class Fused:
 
         kinds: list[PyTree] = []
         with _inside():
-            traced = jax.make_jaxpr(without_keys)(*map(_shape_without_key, avals))
+            traced = _without_key_constants(
+                jax.make_jaxpr(without_keys)(*map(_shape_without_key, avals))
+            )
         results, tree = jax.tree.flatten(kinds[-1])
         # A constant that is a tracer comes from a function that is being traced around this one.
         # Its value is not known now, so the kernel takes it as one more argument.
@@ -455,6 +457,23 @@ def _without_key(x: Array) -> Array:
 def _with_key(kind: ShapedArray, x: Array) -> Array:
     """Return an array as it is of a kind; the inverse of `_without_key`."""
     return jax.random.wrap_key_data(x, impl=_key_kind(kind.dtype)) if _is_key(kind) else x
+
+
+def _without_key_constants(traced: ClosedJaxpr) -> ClosedJaxpr:
+    """Return a traced function whose constants are words in place of random keys.
+
+    Keys become constants where a function uses one from outside of it.
+    """
+    words = [_without_key(x) if hasattr(x, "dtype") else x for x in traced.consts]
+    if all(x is y for x, y in zip(words, traced.consts, strict=True)):
+        return traced
+
+    def function(*arguments: Array) -> list[Array]:
+        pairs = zip(traced.consts, words, strict=True)
+        consts = [_with_key(x.aval, y) if hasattr(x, "aval") else x for x, y in pairs]
+        return jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, consts))(*arguments)
+
+    return jax.make_jaxpr(function)(*traced.in_avals)
 
 
 @functools.cache

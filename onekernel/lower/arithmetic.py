@@ -19,7 +19,7 @@ from onekernel.lower.indexing import (
     scalar_array,
     shape_of,
 )
-from onekernel.lower.random_rules import Key, like, words_of
+from onekernel.lower.random_rules import select
 from onekernel.lower.scalar_ir import ExprGraph, Scalar
 
 _FLOAT, _INT = np.dtype(np.float32), np.dtype(np.int32)
@@ -48,15 +48,7 @@ def where(
         condition.reshape((*condition.shape, *trailing)), if_false, if_true
     )
     rows = zip(*(array.ravel() for array in arrays), strict=True)
-    return scalar_array((_select(graph, *row) for row in rows), if_false.shape)
-
-
-def _select(
-    graph: ExprGraph, condition: Scalar, if_false: Scalar | Key, if_true: Scalar | Key
-) -> Scalar | Key:
-    """Select between two scalars, or the words of two random keys."""
-    pairs = zip(words_of(if_false), words_of(if_true), strict=True)
-    return like(if_true, (graph.select(condition, *pair) for pair in pairs))
+    return scalar_array((select(graph, *row) for row in rows), if_false.shape)
 
 
 def fold(graph: ExprGraph, op: str, initial: Scalar, scalars: Iterable[Scalar]) -> Scalar:
@@ -181,9 +173,6 @@ def _cumulate(op: str, graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> 
 def _arg_extreme(better: str, graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
     (axis,) = equation.params["axes"]
     kind = dtype_of(equation.outvars[0]).type
-    # The graph cannot compare truth values.
-    if dtype_of(equation.invars[0]) == np.dtype(bool):
-        x = scalar_array((graph.convert(one, np.dtype(np.int32)) for one in x.ravel()), x.shape)
     x = np.moveaxis(x, axis, -1)
     places = full_array(x.shape[:-1], lambda: kind(0))
     # Keep the best scalar so far and its place; a later one must be better, so the first of
@@ -225,11 +214,18 @@ def _dot_general(
     return scalar_array(sums, shape_of(equation.outvars[0]))
 
 
-def _lowest(dtype: np.dtype) -> np.floating:
+def _lowest(dtype: np.dtype) -> Scalar:
     """Return the number that changes no maximum: max(-inf, x) is x."""
-    if dtype.kind != "f":
-        raise UnsupportedError(f"the extreme of {dtype}")
-    return dtype.type(-np.inf)
+    if dtype.kind == "b":
+        return np.bool_(False)
+    return dtype.type(-np.inf if dtype.kind == "f" else np.iinfo(dtype).min)
+
+
+def _highest(dtype: np.dtype) -> Scalar:
+    """Return the number that changes no minimum."""
+    if dtype.kind == "b":
+        return np.bool_(True)
+    return dtype.type(np.inf if dtype.kind == "f" else np.iinfo(dtype).max)
 
 
 def _group_axes(x: ScalarArray, batch: Sequence[int], summed: Sequence[int]) -> ScalarArray:
@@ -255,7 +251,7 @@ ARITHMETIC_RULES: dict[str, Rule] = {
     "reduce_and": functools.partial(_reduce, "and", lambda dtype: ~dtype.type(0)),
     "reduce_or": functools.partial(_reduce, "or", lambda dtype: dtype.type(0)),
     "reduce_max": functools.partial(_reduce, "max", _lowest),
-    "reduce_min": functools.partial(_reduce, "min", lambda dtype: -_lowest(dtype)),
+    "reduce_min": functools.partial(_reduce, "min", _highest),
     "cummax": functools.partial(_cumulate, "max"),
     "cummin": functools.partial(_cumulate, "min"),
     "cumprod": functools.partial(_cumulate, "mul"),

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
@@ -24,6 +25,7 @@ from onekernel.lower.indexing import (
     scalar_array,
     shape_of,
 )
+from onekernel.lower.random_rules import Key, select
 from onekernel.lower.scalar_ir import (
     ExprGraph,
     Scalar,
@@ -82,7 +84,7 @@ def _select(
     graph: ExprGraph, condition: Scalar, if_false: ScalarArray, if_true: ScalarArray
 ) -> ScalarArray:
     pairs = zip(if_false.ravel(), if_true.ravel(), strict=True)
-    return scalar_array((graph.select(condition, *pair) for pair in pairs), if_true.shape)
+    return scalar_array((select(graph, condition, *pair) for pair in pairs), if_true.shape)
 
 
 def _read_window(
@@ -184,7 +186,7 @@ def _write_window(
         for index, number in zip(np.ndindex(*update.shape), update.ravel(), strict=True):
             at: tuple[int, ...] = tuple(a + b for a, b in zip(offset, index, strict=True))
             new = combine(x[at], number)
-            result[at] = graph.select(is_here, result[at], new)
+            result[at] = select(graph, is_here, result[at], new)
     return result
 
 
@@ -220,7 +222,7 @@ def gather(
     # In the mode FILL, a window that reaches beyond the array is read as the fill value; otherwise
     # it is moved inside.
     is_filled = "FILL" in str(equation.params["mode"])
-    fill = dtype_of(equation.outvars[0]).type(fill_value(equation)) if is_filled else None
+    fill = _fill(equation) if is_filled else None
     fixed = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
     window_shape = [size for axis, size in enumerate(sizes) if axis not in fixed]
     result = np.empty((*indices.shape[:-1], *window_shape), object)
@@ -234,6 +236,14 @@ def gather(
     return _with_offsets(result, dims.offset_dims, len(window_shape)).reshape(
         shape_of(equation.outvars[0])
     )
+
+
+def _fill(equation: JaxprEqn) -> Scalar | Key:
+    """Return what a gather reads outside of its operand: of a key, words of all bits."""
+    dtype = dtype_of(equation.outvars[0])
+    if jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        return Key(np.uint32(2**32 - 1), np.uint32(2**32 - 1))
+    return dtype.type(fill_value(equation))
 
 
 def _with_offsets(result: ScalarArray, offsets: Sequence[int], count: int) -> ScalarArray:

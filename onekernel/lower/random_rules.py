@@ -43,6 +43,14 @@ def like(x: Scalar | Key, words: Iterable[Scalar]) -> Scalar | Key:
     return Key(next(words), next(words)) if isinstance(x, Key) else next(words)
 
 
+def select(
+    graph: ExprGraph, condition: Scalar, if_false: Scalar | Key, if_true: Scalar | Key
+) -> Scalar | Key:
+    """Select between two scalars, or the words of two random keys."""
+    pairs = zip(words_of(if_false), words_of(if_true), strict=True)
+    return like(if_true, (graph.select(condition, *pair) for pair in pairs))
+
+
 def threefry(graph: ExprGraph, key: Key, first: Scalar, second: Scalar) -> Key:
     """Return the hash of a count of 64 bits, in two words, under a key; all scalars are uint32."""
     add = functools.partial(graph.apply, "add")
@@ -130,6 +138,7 @@ def _fold_in(
 
 RANDOM_RULES: dict[str, Rule] = {
     "random_bits": _bits,
+    "random_clone": lambda graph, equation, key: key,
     "random_fold_in": _fold_in,
     "random_split": _split,
     "random_unwrap": _unwrap,

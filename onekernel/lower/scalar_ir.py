@@ -107,6 +107,19 @@ def is_constant(x: Scalar) -> "TypeIs[Constant]":
 
 COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
 
+_OF_TRUTHS = {
+    "max": ("or", False, False),
+    "min": ("and", False, False),
+    "add": ("or", False, False),
+    "mul": ("and", False, False),
+    "lt": ("and", True, False),
+    "gt": ("and", False, True),
+    "le": ("or", True, False),
+    "ge": ("or", False, True),
+}
+"""What arithmetic and order are between truth values: the operation of logic that takes their
+place, and whether it inverts its first and its second operand. False is below True."""
+
 _FLOAT, _INT, _BOOL = np.dtype(np.float32), np.dtype(np.int32), np.dtype(bool)
 _UINT = np.dtype(np.uint32)
 _DTYPES = (_FLOAT, _INT, _UINT, _BOOL)
@@ -259,6 +272,12 @@ class ExprGraph:
         # cannot.
         if operand_dtype not in _DTYPES or any(x.dtype != operand_dtype for x in operands):
             raise UnsupportedError(f"{op} of {', '.join(str(x.dtype) for x in operands)}")
+        if operand_dtype == _BOOL and op in _OF_TRUTHS:
+            logic, is_first_inverted, is_second_inverted = _OF_TRUTHS[op]
+            x, y = operands
+            x = self.apply("not", x) if is_first_inverted else x
+            y = self.apply("not", y) if is_second_inverted else y
+            return self.apply(logic, x, y)
         # A simplification may return an existing scalar, a constant, or a longer formula of basic
         # operations.
         if simplify := self._simplifications.get(op):

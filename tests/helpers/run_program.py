@@ -15,9 +15,11 @@ def evaluate(program, leaves):
         run.values |= {x.index: columns[..., i] for i, x in enumerate(array.ravel())}
     with np.errstate(all="ignore"):
         run.block(program.block)
+    # Nothing cannot be stacked: of an array of size 0, NumPy makes the result from the shape alone.
+    columns = [[run.look_up(x) for x in array.ravel()] for array in program.outputs]
     return [
-        np.stack([run.look_up(x) for x in array.ravel()], -1).reshape(*batch, *array.shape)
-        for array in program.outputs
+        (np.stack(found, -1) if found else np.zeros(0)).reshape(*batch, *array.shape)
+        for found, array in zip(columns, program.outputs, strict=True)
     ]
 
 

@@ -113,6 +113,16 @@ def test_whole_numbers_reach_their_kernel_as_they_are():
     assert "bitcast_convert" not in text
 
 
+def test_a_key_from_outside_of_a_function_is_part_of_its_kernel():
+    def draw(key, x):
+        return jax.vmap(fuse(lambda x: x + jax.random.normal(key), on_unsupported="raise"))(x)
+
+    key, x = jax.random.key(7), robots(17)
+    expected = x + jax.random.normal(key)
+    agree(draw(key, x), expected)
+    agree(jax.jit(draw)(key, x), expected)
+
+
 LONG = 2_000
 
 

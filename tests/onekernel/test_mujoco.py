@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+from helpers.mjx_comparison import assert_moves_as_in_mjx
 from helpers.small_kernels import launches
 from helpers.small_models import (
     BUTTON,
     CART_POLE,
     HOPPER,
-    STATE,
+    batch_of,
+    by_mjx,
     c_steps,
     chain,
     difference,
@@ -51,27 +53,6 @@ SENSES = """
 </mujoco>
 """
 """A leg whose foot touches the floor at some angles, with sensors."""
-
-
-def batch_of(step, states):
-    """The states of several instances, from their fields."""
-    made = jax.vmap(step.init)(states["qpos"], states["qvel"])
-    return made.replace(**{name: jnp.asarray(x) for name, x in states.items()})
-
-
-def by_mjx(step, states, ctrl):
-    """The fields after one physics step of `mjx.step`, which XLA compiles."""
-
-    def one(state, ctrl):
-        with jax.default_matmul_precision("highest"):
-            return step.from_data(mjx.step(step.model, step.to_data(state, ctrl)))
-
-    # On a CPU: on a GPU, XLA's sums differ by 3e-6 from those that it and the kernel find here.
-    # Compile in a third of the time: the test makes one step only.
-    options = {"xla_backend_optimization_level": 0}
-    states, ctrl = jax.device_put((states, ctrl), jax.devices("cpu")[0])
-    after = jax.jit(jax.vmap(one), compiler_options=options)(states, ctrl)
-    return {name: np.asarray(getattr(after, name)) for name in STATE}
 
 
 def compared(model, *, with_mjx=False, n_substeps=1):
@@ -290,11 +271,12 @@ ASSETS = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "as
 def test_a_model_of_gymnasium_moves_as_in_mjx(name):
     model = mujoco.MjModel.from_xml_path(os.path.join(ASSETS, f"{name}.xml"))
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    assert compared(model, with_mjx=True)[1] < 1e-6
+    assert_moves_as_in_mjx(model, *c_steps(model, 64))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
 @pytest.mark.parametrize("xml", [CART_POLE, HOPPER, BUTTON], ids=["cart", "hopper", "button"])
 def test_a_model_moves_as_in_mjx_with_every_integrator(xml, integrator):
-    assert compared(model_of(xml, integrator), with_mjx=True)[1] < 1e-6
+    model = model_of(xml, integrator)
+    assert_moves_as_in_mjx(model, *c_steps(model, 64))

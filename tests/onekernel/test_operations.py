@@ -139,6 +139,22 @@ if jax.default_backend() == "cpu":
     # By cuDNN, a NaN reaches more of a row than the numbers that it is added to.
     ROWS["filtered"] = lambda x: jnp.convolve(x, x[:3])
 
+WHOLE_ROWS = {
+    **named("max", "min", "argmax", "argmin", "sort", "cumsum", "prod"),
+    "largest of words": lambda x: jnp.max(x.view(jnp.uint32)),
+    "smallest of words": lambda x: jnp.min(x.view(jnp.uint32)),
+    "largest of truths": lambda x: jnp.max(x > 0),
+    "smallest of truths": lambda x: jax.lax.reduce_min(x > 0, (0,)),
+    "larger truths": lambda x: (jnp.maximum(x > 0, x > 5), jnp.minimum(x > 0, x > 5)),
+    "order of truths": lambda x: [
+        f(x > 0, x > 5) for f in (jax.lax.lt, jax.lax.le, jax.lax.gt, jax.lax.ge)
+    ],
+    "sorted truths": lambda x: jnp.sort(x > 0),
+    "product of truths": lambda x: jnp.dot(x > 0, x < 9),
+    "counted truths": lambda x: (jnp.sum(x > 0), jnp.prod(x > 0), jnp.cumsum(x > 0)),
+    "largest of none": lambda x: jnp.max(x[:0], initial=-7),
+}
+
 INDEXED = {
     "one": lambda x, i: x[i],
     "several": lambda x, i: x[jnp.stack([i, i + 1, -i])],
@@ -243,6 +259,8 @@ def test_functions_of_whole_numbers():
     x[: len(ENDS), 0], y[: len(ENDS), 0] = ENDS, ENDS[::-1]
     x[: len(ENDS), 1], y[: len(ENDS), 1] = ENDS[4], ENDS
     found, expected = both(WHOLE, [x, y])
+    assert_close(found, expected)
+    found, expected = both(WHOLE_ROWS, [x])
     assert_close(found, expected)
 
 
