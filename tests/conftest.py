@@ -30,6 +30,8 @@ if os.environ["JAX_PLATFORMS"] == "cpu":
         _flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ.setdefault("XLA_FLAGS", " ".join(_flags))
 os.environ.setdefault("MPLBACKEND", "agg")
+# The cores are the workers': threads of NumPy's products would wait for one, and burn another.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if sys.dont_write_bytecode:
     # A hundred processes would compile every module from its source: an eighth of what they cost.
     sys.dont_write_bytecode, sys.pycache_prefix = False, str(ROOT / ".cache" / "bytecode")

@@ -28,11 +28,27 @@ SHORT = (
 IMAGES = {"image/png", "image/jpeg", "image/gif"}
 
 
+GLIDE = f"""
+import atexit, functools, sys
+sys.path.append({str(Path(__file__).parents[1])!r})
+from helpers import gliding
+everywhere = gliding.everywhere()
+everywhere.__enter__()
+atexit.register(everywhere.__exit__, None, None, None)  # not before, though its name is forgotten
+from jetbot_mjx.viewers import gallery, video
+gallery.VideoRenderer = functools.partial(video.VideoRenderer, side=64, fps=2)
+"""
+"""What the kernel begins with: a robot that glides, and small videos."""
+
+
 @pytest.fixture(scope="module")
-def execute(root, tmp_path_factory):
-    """Runs a notebook with this interpreter; the runs share one folder, hence the module."""
+def kernel(root, tmp_path_factory):
+    """One process for all notebooks, which imports once what they import."""
     folder = tmp_path_factory.mktemp("notebooks")
     write_kernel_spec(folder / "jupyter" / "kernels" / "this")
+    startup = folder / "ipython" / "profile_default" / "startup" / "glide.py"
+    startup.parent.mkdir(parents=True)
+    startup.write_text(GLIDE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JETBOT_CONFIG", str(root / "configs" / "smoke.yaml"))
         patch.setenv("JETBOT_RUN_DIR", str(folder / "run"))
@@ -44,43 +60,34 @@ def execute(root, tmp_path_factory):
         patch.setenv("JUPYTER_PATH", str(folder / "jupyter"))
         patch.setenv("JUPYTER_RUNTIME_DIR", str(folder / "runtime"))
         patch.setenv("JUPYTER_PLATFORM_DIRS", "1")
+        patch.setenv("IPYTHONDIR", str(folder / "ipython"))
         # The kernel sets its own back end, which puts metrics into the notebook.
         patch.delenv("MPLBACKEND", raising=False)
-
-        def run(name, profile="ipython"):
-            patch.setenv("IPYTHONDIR", str(folder / profile))
-            notebook = nbformat.read(root / "notebooks" / f"{name}.ipynb", as_version=4)
-            client = NotebookClient(
-                notebook,
-                kernel_name="this",
-                timeout=300,
-                resources={"metadata": {"path": str(root / "notebooks")}},
-            )
-            return client.execute()
-
-        yield run
+        resources = {"metadata": {"path": str(root / "notebooks")}}
+        client = NotebookClient(
+            nbformat.v4.new_notebook(), kernel_name="this", timeout=300, resources=resources
+        )
+        with client.setup_kernel():
+            yield client
 
 
 @pytest.fixture(scope="module")
-def gliding_profile(tmp_path_factory):
-    """A folder of IPython's from which every kernel begins with a robot that glides, and with
-    small videos."""
-    profile = tmp_path_factory.mktemp("gliding")
-    startup = profile / "profile_default" / "startup" / "glide.py"
-    startup.parent.mkdir(parents=True)
-    tests = str(Path(__file__).parents[1])
-    startup.write_text(
-        f"import sys\nsys.path.append({tests!r})\nfrom helpers import gliding\n"
-        "everywhere = gliding.everywhere()\neverywhere.__enter__()\n"
-        "import functools\nfrom jetbot_mjx.viewers import gallery, video\n"
-        "gallery.VideoRenderer = functools.partial(video.VideoRenderer, side=64, fps=2)\n"
-    )
-    return profile
+def execute(root, kernel):
+    """Runs a notebook; the runs share one folder, hence the module."""
+
+    def run(name):
+        notebook = nbformat.read(root / "notebooks" / f"{name}.ipynb", as_version=4)
+        # It finds no name of the notebook before it.
+        notebook.cells.insert(0, nbformat.v4.new_code_cell("%reset -f"))
+        kernel.nb = notebook
+        return kernel.execute(cleanup_kc=False)
+
+    return run
 
 
 @pytest.fixture(scope="module")
-def trained(execute, gliding_profile):
-    return execute("02_train", gliding_profile)
+def trained(execute):
+    return execute("02_train")
 
 
 @pytest.fixture(scope="module")
@@ -105,35 +112,6 @@ def text(notebook):
 def html(notebook):
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     return "".join(output.get("data", {}).get("text/html", "") for output in outputs)
-
-
-def test_environment_notebook_runs(execute):
-    notebook = execute("01_environment")
-    assert images(notebook) == ["image/png"] * 2
-    assert "<video" in html(notebook)
-    assert "20 different goals in 20 episodes" in text(notebook)
-
-
-def test_training_notebook_runs(trained):
-    assert images(trained) == ["image/png"]
-    assert "best policy" in text(trained)
-
-
-def test_evaluation_notebook_shows_the_run_of_the_training_notebook(
-    execute, gliding_profile, trained
-):
-    notebook = execute("03_evaluate_and_render", gliding_profile)
-    assert images(notebook) == ["image/png", "image/png", "image/gif"]
-    assert "scripted" in text(notebook)
-
-
-@pytest.mark.slow
-def test_the_notebook_of_a_new_task_trains_it_from_a_blank_class(execute, gliding_profile):
-    notebook = execute("04_own_task", gliding_profile)
-    assert images(notebook) == ["image/png", "image/gif"]
-    assert "blank_task:BlankTask sees" in text(notebook)
-    assert "training parking_task:ParkingTask" in text(notebook)
-    assert "reward/parked" in text(notebook)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -171,3 +149,33 @@ def test_the_first_cell_installs_what_is_not_there(read, name, monkeypatch):
 
 def test_every_notebook_is_tested(root):
     assert sorted(path.stem for path in (root / "notebooks").glob("*.ipynb")) == list(NAMES)
+
+
+# What follows asks for the kernel, which ends, and is paid for, with the last.
+
+
+def test_environment_notebook_runs(execute):
+    notebook = execute("01_environment")
+    assert images(notebook) == ["image/png"] * 2
+    assert "<video" in html(notebook)
+    assert "20 different goals in 20 episodes" in text(notebook)
+
+
+def test_training_notebook_runs(trained):
+    assert images(trained) == ["image/png"]
+    assert "best policy" in text(trained)
+
+
+def test_evaluation_notebook_shows_the_run_of_the_training_notebook(execute, trained):
+    notebook = execute("03_evaluate_and_render")
+    assert images(notebook) == ["image/png", "image/png", "image/gif"]
+    assert "scripted" in text(notebook)
+
+
+@pytest.mark.slow
+def test_the_notebook_of_a_new_task_trains_it_from_a_blank_class(execute):
+    notebook = execute("04_own_task")
+    assert images(notebook) == ["image/png", "image/gif"]
+    assert "blank_task:BlankTask sees" in text(notebook)
+    assert "training parking_task:ParkingTask" in text(notebook)
+    assert "reward/parked" in text(notebook)
