@@ -19,7 +19,9 @@ finite.
 This is the only module that needs MuJoCo and MJX: `pip install mujoco-mjx`.
 """
 
+import contextlib
 import dataclasses
+import io
 import threading
 import warnings
 from collections.abc import Mapping
@@ -30,11 +32,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
-from mujoco import mjx
 
 from onekernel.backends import Kernel, default_backend
 from onekernel.errors import KernelError, UnsupportedError
 from onekernel.lower import scalarize
+
+# MJX prints two lines where its optional part Warp is not installed.
+with contextlib.redirect_stdout(io.StringIO()):
+    from mujoco import mjx
 
 __all__ = ["FusedMjx", "MjxState", "fuse_mjx"]
 

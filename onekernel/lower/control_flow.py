@@ -223,7 +223,8 @@ class ControlFlow:
         """
         if not any(equation.primitive.name == "cond" for equation in scan.body.jaxpr.eqns):
             return []
-        places = [k for k, x in enumerate(scan.carry) if x.shape == () and x.item().dtype == bool]
+        scalars = [(k, x.item()) for k, x in enumerate(scan.carry) if x.shape == ()]
+        places = [k for k, x in scalars if words_of(x)[0].dtype == bool]
         found = []
         for place in places:
             # Run an iteration on values of which nothing is known but that this one is False.

@@ -271,6 +271,23 @@ def test_explain_tells_what_stands_in_the_way(capsys):
     assert re.match(line, out)
 
 
+def test_a_counted_loop_carries_a_random_key_through_a_branch():
+    def walk(x, key):
+        def move(_, state):
+            x, key = state
+            key, drawn = jax.random.split(key)
+            step = jax.random.normal(drawn)
+            return jax.lax.cond(x > 1.0, lambda: x - 0.5 * step, lambda: x + step), key
+
+        return jax.lax.fori_loop(0, 40, move, (x, key))
+
+    x, keys = jnp.zeros(16), jax.random.split(jax.random.key(3), 16)
+    ours, ours_keys = jax.vmap(fuse(walk, on_unsupported="raise"))(x, keys)
+    theirs, their_keys = jax.jit(jax.vmap(walk))(x, keys)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(*map(jax.random.key_data, (ours_keys, their_keys)))
+
+
 def test_jax_exports_the_function_itself_and_says_that_it_cannot_export_a_kernel():
     @fuse
     def wave(x):

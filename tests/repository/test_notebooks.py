@@ -14,7 +14,10 @@ from ipykernel.kernelspec import write_kernel_spec
 from IPython.core.interactiveshell import InteractiveShell
 from nbclient import NotebookClient
 
-NAMES = ("01_environment", "02_train", "03_evaluate_and_render", "04_own_task")
+NAMES = (
+    *("01_environment", "02_train", "03_evaluate_and_render", "04_own_task"),
+    "05_one_kernel",
+)
 
 SHORT = (
     "checkpoint_interval=16384",
@@ -55,6 +58,7 @@ def kernel(root, tmp_path_factory):
         # As many as are rendered, whose program is the same.
         patch.setenv("JETBOT_EPISODES", "1")
         patch.setenv("JETBOT_OWN_DIR", str(folder / "own"))
+        patch.setenv("ONEKERNEL_INSTANCES", "32")
         patch.setenv("JETBOT_OVERRIDES", " ".join(SHORT))
         # Nothing of the user's own Jupyter, and nothing left in it.
         patch.setenv("JUPYTER_PATH", str(folder / "jupyter"))
@@ -170,6 +174,20 @@ def test_evaluation_notebook_shows_the_run_of_the_training_notebook(execute, tra
     notebook = execute("03_evaluate_and_render")
     assert images(notebook) == ["image/png", "image/png", "image/gif"]
     assert "scripted" in text(notebook)
+
+
+def test_the_notebook_about_kernels_compares_them_with_xla_and_c_mujoco(execute):
+    notebook = execute("05_one_kernel")
+    assert images(notebook) == ["image/png"]
+    printed = text(notebook)
+    assert printed.count("one kernel   compiled in") == 3
+    assert printed.count("XLA          compiled in") == 2
+    assert "balance is one kernel" in printed
+    assert "<lambda> is no kernel: one kernel cannot do a conversion to complex64" in printed
+    # Of a chaotic system, round-off grows; it is small after the time that is integrated here.
+    (apart, velocity) = re.findall(r"largest difference (?:of a velocity )?(\S+?),?\s", printed)
+    assert float(apart) < 0.1
+    assert float(velocity) < 1e-5
 
 
 @pytest.mark.slow
