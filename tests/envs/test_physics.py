@@ -20,7 +20,7 @@ from jetbot_mjx.envs.state import PhysicsState
 from onekernel import cpu, gpu
 
 STEPS = 256
-ROBOTS = 256  # under each kind of commands
+FEW, MANY = 64, 256  # robots under each kind of commands
 POSITION_TOLERANCE = 0.2  # [mm] of every robot with the preset's friction, over 256 control steps
 YAW_TOLERANCE = 0.05  # [°] likewise
 SLIPPERY_MEDIAN, SLIPPERY_P95 = 0.005, 0.05  # [mm] at μ = 0.4, where single robots are chaotic
@@ -124,22 +124,25 @@ def on_floor(request, driver):
 
 
 @pytest.mark.parametrize(
-    ("driver", "on_floor"),
+    ("driver", "on_floor", "robots"),
     [
-        ("isaac", 1.0),
-        ("real", 0.4),
-        pytest.param("isaac", 0.4, marks=pytest.mark.slow),
-        pytest.param("real", 1.0, marks=pytest.mark.slow),
+        ("isaac", 1.0, FEW),
+        ("real", 0.4, FEW),
+        *(
+            pytest.param(preset, friction, MANY, marks=pytest.mark.slow)
+            for preset in ("isaac", "real")
+            for friction in (1.0, 0.4)
+        ),
     ],
-    indirect=True,
+    indirect=["driver", "on_floor"],
 )
-def test_mjx_follows_c_mujoco(driver, on_floor):
+def test_mjx_follows_c_mujoco(driver, on_floor, robots):
     env, drive = driver
     friction, mjx_model, reference = on_floor
     rng = np.random.default_rng(0)
-    actions = jnp.concatenate([switched(rng, draw, ROBOTS) for draw in (uniform, bang_bang)])
+    actions = jnp.concatenate([switched(rng, draw, robots) for draw in (uniform, bang_bang)])
     ours = jax.device_get(drive(mjx_model, actions))
-    first = jax.device_get(jax.vmap(env.reset)(jnp.zeros((2 * ROBOTS, 2), jnp.uint32)))
+    first = jax.device_get(jax.vmap(env.reset)(jnp.zeros((2 * robots, 2), jnp.uint32)))
     first = first.pipeline_state
     ctrl = np.asarray(jax.vmap(jax.vmap(env.wheel_targets))(actions)).swapaxes(0, 1)
     substeps = env.config.physics.n_substeps
@@ -183,7 +186,7 @@ def single_steps_agree(case, env, mjx_model, theirs, ctrl):
         f" {len(outliers)} of {len(error):,} above {STEP_OUTLIER}"
     )
     for index in outliers:
-        before, robot = divmod(index, 2 * ROBOTS)
+        before, robot = divmod(index, ctrl.shape[1])
         print(f"  robot {robot}, control step {before + 1}: {error[index]:.1e} m/s")
     assert np.quantile(error, 0.999) < STEP_TOLERANCE
     assert len(outliers) <= len(error) / 10_000
@@ -216,7 +219,16 @@ def test_straight_driving_and_spinning_match_closed_form(driver):
     np.testing.assert_allclose(velocity[2, 5], expected[2, 1], rtol=CLOSED_FORM_TOLERANCE)
 
 
-@pytest.mark.parametrize("friction", [1.0, 0.4])
+@pytest.mark.parametrize(
+    ("driver", "friction"),
+    [
+        ("isaac", 0.4),
+        ("real", 1.0),
+        pytest.param("isaac", 1.0, marks=pytest.mark.slow),
+        pytest.param("real", 0.4, marks=pytest.mark.slow),
+    ],
+    indirect=["driver"],
+)
 def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     env, drive = driver
     robot = dataclasses.replace(env.robot, friction=friction)
@@ -235,7 +247,14 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     (gpu if jax.default_backend() == "gpu" else cpu).obstacle() is not None,
     reason="XLA takes no kernels here",
 )
-def test_another_solver_is_another_kernel():
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("iterations",),
+        pytest.param(("ls_iterations", "tolerance"), marks=pytest.mark.slow),
+    ],
+)
+def test_another_solver_is_another_kernel(names):
     # The number of iterations is not among the arrays of MJX's model, so that a key made of the
     # arrays alone would be the same.
     env = make_env(parse_config({}))
@@ -252,8 +271,9 @@ def test_another_solver_is_another_kernel():
 
     plain = kernels()
     assert kernels() == plain
-    others = [{"iterations": 3}, {"ls_iterations": 3}, {"tolerance": option.tolerance * 10}]
-    assert len({plain, *(kernels(**changed) for changed in others)}) == 4
+    changed = {"iterations": 3, "ls_iterations": 3, "tolerance": option.tolerance * 10}
+    others = (kernels(**{name: changed[name]}) for name in names)
+    assert len({plain, *others}) == 1 + len(names)
 
 
 def test_physics_keeps_full_precision_in_its_matrix_products():
