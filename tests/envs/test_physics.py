@@ -36,19 +36,17 @@ true_yaw = jax.jit(jax.vmap(jax.vmap(kinematics.yaw)))
 
 @pytest.fixture(scope="module", params=["isaac", "real"])
 def driver(request):
-    """An environment and `(model, actions (n, t, 2)) -> physics (t, n, ...)`."""
+    """An environment and `(environment, actions (n, t, 2)) -> physics (t, n, ...)`."""
     env = make_env(parse_config({"robot": {"preset": request.param}}))
 
-    def drive(mjx_model, actions):
-        here = env.with_model(mjx_model)
-
+    def drive(here, actions):
         def step(physics, action):
             ctrl = jax.vmap(env.wheel_targets)(action)
             physics = jax.vmap(here.physics.step)(physics, ctrl)
             return physics, physics
 
         keys = jnp.zeros((len(actions), 2), jnp.uint32)
-        first = jax.vmap(env.reset)(keys).pipeline_state
+        first = jax.jit(jax.vmap(env.reset))(keys).pipeline_state
         return jax.lax.scan(step, first, actions.swapaxes(0, 1))[1]
 
     return env, drive
@@ -116,11 +114,12 @@ def apart(one, other):
 
 @pytest.fixture(scope="module")
 def on_floor(request, driver):
-    """Physics on a floor of some friction, and the same in C MuJoCo, converged."""
+    """An environment on a floor of some friction, and its model in C MuJoCo, converged."""
     env, _ = driver
     robot = dataclasses.replace(env.robot, friction=request.param)
     mj_model = make_mj_model(robot, env.config.physics, visual=False)
-    return request.param, mjx.put_model(mj_model), converged(copy.copy(mj_model))
+    here = env.with_model(mjx.put_model(mj_model))
+    return request.param, here, converged(copy.copy(mj_model))
 
 
 @pytest.mark.parametrize(
@@ -138,11 +137,11 @@ def on_floor(request, driver):
 )
 def test_mjx_follows_c_mujoco(driver, on_floor, robots):
     env, drive = driver
-    friction, mjx_model, reference = on_floor
+    friction, here, reference = on_floor
     rng = np.random.default_rng(0)
     actions = jnp.concatenate([switched(rng, draw, robots) for draw in (uniform, bang_bang)])
-    ours = jax.device_get(drive(mjx_model, actions))
-    first = jax.device_get(jax.vmap(env.reset)(jnp.zeros((2 * robots, 2), jnp.uint32)))
+    ours = jax.device_get(drive(here, actions))
+    first = jax.device_get(jax.jit(jax.vmap(env.reset))(jnp.zeros((2 * robots, 2), jnp.uint32)))
     first = first.pipeline_state
     ctrl = np.asarray(jax.vmap(jax.vmap(env.wheel_targets))(actions)).swapaxes(0, 1)
     substeps = env.config.physics.n_substeps
@@ -170,14 +169,13 @@ def test_mjx_follows_c_mujoco(driver, on_floor, robots):
         assert p95 < SLIPPERY_P95
         # Two counts of rare events: their difference deviates by the root of their sum.
         assert astray - allowed <= 3 * math.sqrt(astray + allowed)
-    single_steps_agree(case, env, mjx_model, theirs, ctrl)
+    single_steps_agree(case, here, theirs, ctrl)
 
 
-def single_steps_agree(case, env, mjx_model, theirs, ctrl):
+def single_steps_agree(case, env, theirs, ctrl):
     """Check single control steps, from each state of the converged path to the next one."""
     states = jax.tree.map(lambda x: jnp.float32(x[:-1].reshape(-1, *x.shape[2:])), theirs)
-    step = env.with_model(mjx_model).physics.step
-    ahead = jax.jit(jax.vmap(step))(states, ctrl[1:].reshape(-1, 2))
+    ahead = jax.jit(jax.vmap(env.physics.step))(states, ctrl[1:].reshape(-1, 2))
     error = np.asarray(ahead.qvel) - theirs.qvel[1:].reshape(ahead.qvel.shape)
     error = np.linalg.norm(error[:, :3], axis=-1)
     outliers = np.flatnonzero(error > STEP_OUTLIER)
@@ -192,13 +190,16 @@ def single_steps_agree(case, env, mjx_model, theirs, ctrl):
     assert len(outliers) <= len(error) / 10_000
 
 
+@pytest.mark.parametrize(
+    "driver", [pytest.param("isaac", marks=pytest.mark.slow), "real"], indirect=True
+)
 def test_straight_driving_and_spinning_match_closed_form(driver):
     env, drive = driver
     limits = {"max_speed": 1.0, "max_yaw_rate": math.pi}
     speed = 1.0 if env.robot.max_wheel_speed is None else 0.4
     twists = jnp.array([[speed, 0.0], [0.0, math.pi], [0.0, -1.0]])
     actions = jax.vmap(lambda twist: kinematics.action_from_twist(twist, **limits))(twists)
-    physics = drive(env.mjx_model, jnp.repeat(actions[:, None], STEPS, axis=1))
+    physics = drive(env, jnp.repeat(actions[:, None], STEPS, axis=1))
     velocity = np.asarray(physics.qvel[120:]).mean(axis=0)  # after the motors' run-up
     geometry = {
         "wheel_radius": robot_model.WHEEL_RADIUS,
@@ -235,10 +236,10 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     mjx_model = mjx.put_model(make_mj_model(robot, env.config.physics, visual=False))
     rng = np.random.default_rng(1)
     actions = jnp.concatenate([held(rng, bang_bang, 64, hold) for hold in (4, 8, 16, 32)])
-    physics = drive(mjx_model, actions)
+    physics = drive(env.with_model(mjx_model), actions)
     assert np.all(np.isfinite(physics.qpos))
     assert np.all(np.isfinite(physics.qvel))
-    tilt = np.degrees(jax.vmap(jax.vmap(motion.tilt))(physics.qpos[:, :, 3:7]).max())
+    tilt = np.degrees(jax.jit(jax.vmap(jax.vmap(motion.tilt)))(physics.qpos[:, :, 3:7]).max())
     print(f"\n{env.config.robot.preset}, friction {friction}: worst tilt {tilt:.2f}°")
     assert tilt < WORST_TILT
 
