@@ -276,7 +276,9 @@ def test_without_a_cpu_for_jax_it_says_what_to_set(world_env, monkeypatch):
         in_mujoco(world_env)
 
 
-@pytest.mark.parametrize("run", ["jetbot_egocentric", "real_jetbot"])
+@pytest.mark.parametrize(
+    "run", [pytest.param("jetbot_egocentric", marks=pytest.mark.slow), "real_jetbot"]
+)
 def test_the_shipped_policies_drive_there_too(run):
     checkpoint = load_checkpoint(PRETRAINED / run)
     env = in_mujoco(checkpoint.make_env())

@@ -106,6 +106,9 @@ def test_without_a_difference_the_robot_is_its_preset_to_the_bit(driver):
     jax.tree.map(np.testing.assert_array_equal, varied(RobotParams()), env.mjx_model)
 
 
+@pytest.mark.parametrize(
+    "driver", [pytest.param("isaac", marks=pytest.mark.slow), "real"], indirect=True
+)
 def test_without_a_difference_the_robot_drives_as_its_preset(driver, actions):
     """Not to the bit: where a number is known, a kernel has done its arithmetic beforehand."""
     _, drive = driver
