@@ -25,14 +25,20 @@ STEPS = 20
 jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
-@pytest.fixture(scope="module", params=["world", "egocentric"])
+@functools.cache
+def env_and_step(observation):
+    env = make_env(parse_config({"task": {"observation": observation}}))
+    return env, jit(env.step)
+
+
+@pytest.fixture(params=["world", "egocentric"])
 def env(request):
-    return make_env(parse_config({"task": {"observation": request.param}}))
+    return env_and_step(request.param)[0]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def single_step(env):
-    return jit(env.step)
+    return env_and_step(env.config.task.observation)[1]
 
 
 @pytest.fixture(scope="module")

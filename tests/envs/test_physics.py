@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import math
 import re
 
@@ -34,10 +35,10 @@ WORST_TILT = 4.0  # [°]
 true_yaw = jax.jit(jax.vmap(jax.vmap(kinematics.yaw)))
 
 
-@pytest.fixture(scope="module", params=["isaac", "real"])
-def driver(request):
+@functools.cache
+def make_driver(preset):
     """An environment and `(environment, actions (n, t, 2)) -> physics (t, n, ...)`."""
-    env = make_env(parse_config({"robot": {"preset": request.param}}))
+    env = make_env(parse_config({"robot": {"preset": preset}}))
 
     def drive(here, actions):
         def step(physics, action):
@@ -50,6 +51,11 @@ def driver(request):
         return jax.lax.scan(step, first, actions.swapaxes(0, 1))[1]
 
     return env, drive
+
+
+@pytest.fixture(params=["isaac", "real"])
+def driver(request):
+    return make_driver(request.param)
 
 
 def drive_in_c(mj_model, first, ctrl, substeps, noise=0.0):
@@ -112,7 +118,7 @@ def apart(one, other):
     return 1e3 * distance, np.degrees(turned)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def on_floor(request, driver):
     """An environment on a floor of some friction, and its model in C MuJoCo, converged."""
     env, _ = driver
