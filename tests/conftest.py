@@ -1,6 +1,7 @@
 """Shared fixtures: the CPU, a compilation cache in the work tree, environments built once."""
 
 import fcntl
+import functools
 import gc
 import os
 import signal
@@ -150,9 +151,15 @@ def world_env(world_config: Config) -> JetBotEnv:
     return make_env(world_config)
 
 
-@pytest.fixture(scope="session", params=["isaac", "real"])
+@functools.cache
+def _preset_env(preset: str) -> JetBotEnv:
+    return make_env(parse_config({"robot": {"preset": preset}}))
+
+
+@pytest.fixture(params=["isaac", "real"])
 def preset_env(request) -> JetBotEnv:
-    return make_env(parse_config({"robot": {"preset": request.param}}))
+    # Kept by itself: a test that has parameters of its own for it would end a session's fixture.
+    return _preset_env(request.param)
 
 
 @pytest.fixture(scope="session")

@@ -17,20 +17,29 @@ def made(choice):
     return make_env(parse_config({"physics": {"cholesky": choice, "impl": "xla"}}))
 
 
+@pytest.fixture(scope="module")
+def steps():
+    """A first state, and its lowered step with each choice."""
+    envs = {choice: made(choice) for choice in ("unrolled", "library")}
+    state = jax.jit(envs["library"].reset)(jax.random.PRNGKey(0)).pipeline_state
+    lowered = {
+        choice: jax.jit(env.physics.step).lower(state, jnp.zeros(2)) for choice, env in envs.items()
+    }
+    return state, lowered
+
+
 @pytest.mark.parametrize(("choice", "calls"), [("unrolled", False), ("library", True)])
-def test_the_choice_decides_whether_physics_calls_a_library(choice, calls):
-    env = made(choice)
-    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    text = jax.jit(env.physics.step).lower(state, jnp.zeros(2)).as_text()
+def test_the_choice_decides_whether_physics_calls_a_library(steps, choice, calls):
+    text = steps[1][choice].as_text()
     assert any(call in text for call in CALLS) == calls
 
 
-def test_both_choices_make_the_same_step():
+def test_both_choices_make_the_same_step(steps):
+    first, lowered = steps
     states = []
     for choice in ("unrolled", "library"):
-        env = made(choice)
-        states.append(env.reset(jax.random.PRNGKey(0)).pipeline_state)
-        step = jax.jit(env.physics.step)
+        step = lowered[choice].compile()
+        states.append(first)
         for _ in range(5):
             states[-1] = step(states[-1], jnp.array([4.0, 9.0]))
     np.testing.assert_allclose(states[0].qvel, states[1].qvel, atol=2e-5)
@@ -46,6 +55,6 @@ def test_nothing_of_jax_is_replaced_while_physics_is_traced(monkeypatch):
 
     monkeypatch.setattr(mjx, "step", looking_round)
     env = made("unrolled")
-    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
     jax.eval_shape(env.physics.step, state, jnp.zeros(2))
     assert set(seen) == {library}

@@ -124,12 +124,12 @@ def test_an_episode_begins_with_motors_at_rest_and_sensors_that_saw_its_start(dr
 def test_the_first_observation_is_exact_and_the_others_are_not(config):
     env = make_env(config)
     varied = maybe_randomize(env)
-    state = varied.reset(jax.random.PRNGKey(5))
-    exact = env.task.observe(robot_state(state.pipeline_state), state.goal)
-    np.testing.assert_array_equal(state.obs, exact)
+    observe = jax.jit(lambda s: env.task.observe(robot_state(s.pipeline_state), s.goal))
+    state = jax.jit(varied.reset)(jax.random.PRNGKey(5))
+    np.testing.assert_array_equal(state.obs, observe(state))
     with gliding.everywhere():
-        state = varied.step(state, jnp.zeros(2))
-    exact = env.task.observe(robot_state(state.pipeline_state), state.goal)
+        state = jax.jit(varied.step)(state, jnp.zeros(2))
+    exact = observe(state)
     assert np.abs(state.obs - exact)[:2].max() > 1e-3
 
 
@@ -162,11 +162,13 @@ def test_the_state_keeps_its_tree_and_the_goal_is_that_of_the_plain_environment(
     assert isinstance(varied, DomainRandomizationWrapper)
     key = report_keys(1)[0]
     first = jax.eval_shape(varied.reset, key)
-    second = jax.eval_shape(varied.step, first, jnp.zeros(2))
+    with gliding.everywhere():
+        second = jax.eval_shape(varied.step, first, jnp.zeros(2))
     assert jax.tree.structure(first) == jax.tree.structure(second)
     same = jax.tree.map(lambda a, b: (a.shape, a.dtype) == (b.shape, b.dtype), first, second)
     assert all(jax.tree.leaves(same))
-    np.testing.assert_array_equal(varied.reset(key).goal, env.reset(key).goal)
+    goals = (jax.jit(lambda key, one=one: one.reset(key).goal)(key) for one in (varied, env))
+    np.testing.assert_array_equal(*goals)
 
 
 def test_nothing_drawn_is_the_program_of_the_plain_environment():
@@ -175,16 +177,18 @@ def test_nothing_drawn_is_the_program_of_the_plain_environment():
     action = jnp.zeros(2)
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     assert state.episode_params is None
-    plain, same = (
-        str(jax.make_jaxpr(one.step)(state, action))
-        for one in (env, make_env(parse_config({"randomization": {}})))
-    )
+    other = make_env(parse_config({"randomization": {}}))
+    with gliding.everywhere():
+        plain, same = (str(jax.make_jaxpr(one.step)(state, action)) for one in (env, other))
     assert plain == same
+    # Physics is a function of its model, and of the numbers of it that are traced.
+    jax.tree.map(np.testing.assert_array_equal, env.physics.model, other.physics.model)
+    assert env.physics._traced_leaves == other.physics._traced_leaves
 
 
 def test_only_what_is_drawn_enters_the_physics():
     few = make_env(parse_config({"randomization": {"friction": [0.5, 1.0]}}))
-    state = maybe_randomize(few).reset(jax.random.PRNGKey(0))
+    state = jax.eval_shape(maybe_randomize(few).reset, jax.random.PRNGKey(0))
     assert jax.tree.leaves((state.episode_params.motors, state.episode_params.sensors)) == []
     varied = []
 
@@ -194,11 +198,12 @@ def test_only_what_is_drawn_enters_the_physics():
             varied.append(env.physics._traced_leaves)
             return env
 
-    jax.eval_shape(
-        DomainRandomizationWrapper(Seen(few.config), ranges=few.config.randomization).step,
-        state,
-        jnp.zeros(2),
-    )
+    with gliding.everywhere():
+        jax.eval_shape(
+            DomainRandomizationWrapper(Seen(few.config), ranges=few.config.randomization).step,
+            state,
+            jnp.zeros(2),
+        )
     assert [len(places) for places in varied] == [1]
 
 

@@ -25,14 +25,20 @@ STEPS = 20
 jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
-@pytest.fixture(scope="module", params=["world", "egocentric"])
+@functools.cache
+def env_and_step(observation):
+    env = make_env(parse_config({"task": {"observation": observation}}))
+    return env, jit(env.step)
+
+
+@pytest.fixture(params=["world", "egocentric"])
 def env(request):
-    return make_env(parse_config({"task": {"observation": request.param}}))
+    return env_and_step(request.param)[0]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def single_step(env):
-    return jit(env.step)
+    return env_and_step(env.config.task.observation)[1]
 
 
 @pytest.fixture(scope="module")
@@ -53,14 +59,17 @@ def same_tree(one, other):
     assert jax.tree.map(shape, one) == jax.tree.map(shape, other)
 
 
+@pytest.mark.parametrize(
+    "env", ["world", pytest.param("egocentric", marks=pytest.mark.slow)], indirect=True
+)
 def test_vmap_equals_a_loop_over_single_environments(env, single_step, keys, actions):
-    batch = jax.vmap(env.reset)(keys)
-    step = jit(jax.vmap(env.step))
-    singles = [env.reset(key) for key in keys]
+    batch = jit(jax.vmap(env.reset))(keys)
+    step, reset = jit(jax.vmap(env.step)), jit(env.reset)
+    singles = [reset(key) for key in keys]
     for t in range(STEPS):
         batch = step(batch, actions[t])
         singles = [single_step(s, a) for s, a in zip(singles, actions[t], strict=True)]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *singles)
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *singles)
     assert float(jnp.abs(batch.pipeline_state.qpos[:, :2]).max()) > 0.05  # they moved
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), batch, stacked

@@ -34,9 +34,9 @@ def test_trimesh_is_loaded_when_a_mesh_needs_it_and_prints_nothing():
 @pytest.mark.parametrize(
     "statement",
     [
-        "from jetbot_mjx import JetBotEnv, load_config",
-        "import jetbot_mjx.agents.ppo",
+        "from jetbot_mjx import JetBotEnv, load_config; import jetbot_mjx.agents.ppo",
         # A process each, and the next test finds whoever imports Brax or MJX before our own.
+        pytest.param("import jetbot_mjx.agents.ppo", marks=pytest.mark.slow),
         pytest.param("import jetbot_mjx.agents.vision", marks=pytest.mark.slow),
         pytest.param("import jetbot_mjx.evaluation.rollout", marks=pytest.mark.slow),
         pytest.param("import jetbot_mjx.runs.warm_start", marks=pytest.mark.slow),

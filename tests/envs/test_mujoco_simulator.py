@@ -73,6 +73,9 @@ def apart(a, b):
     return np.linalg.norm(a[..., :3] - b[..., :3], axis=-1).max()
 
 
+@pytest.mark.parametrize(
+    "preset_env", [pytest.param("isaac", marks=pytest.mark.slow), "real"], indirect=True
+)
 def test_with_the_numerics_of_training_it_drives_as_the_environment_does(preset_env):
     simulator = in_mujoco(preset_env, training_numerics(preset_env.config.physics))
     actions = held(uniform)
@@ -90,7 +93,16 @@ def test_many_robots_in_batches_are_the_robot_of_mujocos_own_loop(preset_env):
         assert apart(driven[index], expected) < ROUNDING
 
 
-@pytest.mark.parametrize(("mass", "shift"), [(0.8, (0.01, 0.005, 0.0)), (1.3, (0.0, 0.0, 0.02))])
+@pytest.mark.parametrize(
+    ("preset_env", "mass", "shift"),
+    [
+        ("isaac", 0.8, (0.01, 0.005, 0.0)),
+        ("real", 1.3, (0.0, 0.0, 0.02)),
+        pytest.param("isaac", 1.3, (0.0, 0.0, 0.02), marks=pytest.mark.slow),
+        pytest.param("real", 0.8, (0.01, 0.005, 0.0), marks=pytest.mark.slow),
+    ],
+    indirect=["preset_env"],
+)
 def test_a_varied_robot_is_the_one_that_mujoco_compiles(preset_env, mass, shift):
     robot = dataclasses.replace(
         preset_env.robot,
@@ -264,7 +276,9 @@ def test_without_a_cpu_for_jax_it_says_what_to_set(world_env, monkeypatch):
         in_mujoco(world_env)
 
 
-@pytest.mark.parametrize("run", ["jetbot_egocentric", "real_jetbot"])
+@pytest.mark.parametrize(
+    "run", [pytest.param("jetbot_egocentric", marks=pytest.mark.slow), "real_jetbot"]
+)
 def test_the_shipped_policies_drive_there_too(run):
     checkpoint = load_checkpoint(PRETRAINED / run)
     env = in_mujoco(checkpoint.make_env())

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import math
 import re
 
@@ -20,7 +21,7 @@ from jetbot_mjx.envs.state import PhysicsState
 from onekernel import cpu, gpu
 
 STEPS = 256
-ROBOTS = 256  # under each kind of commands
+FEW, MANY = 64, 256  # robots under each kind of commands
 POSITION_TOLERANCE = 0.2  # [mm] of every robot with the preset's friction, over 256 control steps
 YAW_TOLERANCE = 0.05  # [°] likewise
 SLIPPERY_MEDIAN, SLIPPERY_P95 = 0.005, 0.05  # [mm] at μ = 0.4, where single robots are chaotic
@@ -34,24 +35,27 @@ WORST_TILT = 4.0  # [°]
 true_yaw = jax.jit(jax.vmap(jax.vmap(kinematics.yaw)))
 
 
-@pytest.fixture(scope="module", params=["isaac", "real"])
-def driver(request):
-    """An environment and `(model, actions (n, t, 2)) -> physics (t, n, ...)`."""
-    env = make_env(parse_config({"robot": {"preset": request.param}}))
+@functools.cache
+def make_driver(preset):
+    """An environment and `(environment, actions (n, t, 2)) -> physics (t, n, ...)`."""
+    env = make_env(parse_config({"robot": {"preset": preset}}))
 
-    def drive(mjx_model, actions):
-        here = env.with_model(mjx_model)
-
+    def drive(here, actions):
         def step(physics, action):
             ctrl = jax.vmap(env.wheel_targets)(action)
             physics = jax.vmap(here.physics.step)(physics, ctrl)
             return physics, physics
 
         keys = jnp.zeros((len(actions), 2), jnp.uint32)
-        first = jax.vmap(env.reset)(keys).pipeline_state
+        first = jax.jit(jax.vmap(env.reset))(keys).pipeline_state
         return jax.lax.scan(step, first, actions.swapaxes(0, 1))[1]
 
     return env, drive
+
+
+@pytest.fixture(params=["isaac", "real"])
+def driver(request):
+    return make_driver(request.param)
 
 
 def drive_in_c(mj_model, first, ctrl, substeps, noise=0.0):
@@ -114,32 +118,36 @@ def apart(one, other):
     return 1e3 * distance, np.degrees(turned)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def on_floor(request, driver):
-    """Physics on a floor of some friction, and the same in C MuJoCo, converged."""
+    """An environment on a floor of some friction, and its model in C MuJoCo, converged."""
     env, _ = driver
     robot = dataclasses.replace(env.robot, friction=request.param)
     mj_model = make_mj_model(robot, env.config.physics, visual=False)
-    return request.param, mjx.put_model(mj_model), converged(copy.copy(mj_model))
+    here = env.with_model(mjx.put_model(mj_model))
+    return request.param, here, converged(copy.copy(mj_model))
 
 
 @pytest.mark.parametrize(
-    ("driver", "on_floor"),
+    ("driver", "on_floor", "robots"),
     [
-        ("isaac", 1.0),
-        ("real", 0.4),
-        pytest.param("isaac", 0.4, marks=pytest.mark.slow),
-        pytest.param("real", 1.0, marks=pytest.mark.slow),
+        ("isaac", 1.0, FEW),
+        ("real", 0.4, FEW),
+        *(
+            pytest.param(preset, friction, MANY, marks=pytest.mark.slow)
+            for preset in ("isaac", "real")
+            for friction in (1.0, 0.4)
+        ),
     ],
-    indirect=True,
+    indirect=["driver", "on_floor"],
 )
-def test_mjx_follows_c_mujoco(driver, on_floor):
+def test_mjx_follows_c_mujoco(driver, on_floor, robots):
     env, drive = driver
-    friction, mjx_model, reference = on_floor
+    friction, here, reference = on_floor
     rng = np.random.default_rng(0)
-    actions = jnp.concatenate([switched(rng, draw, ROBOTS) for draw in (uniform, bang_bang)])
-    ours = jax.device_get(drive(mjx_model, actions))
-    first = jax.device_get(jax.vmap(env.reset)(jnp.zeros((2 * ROBOTS, 2), jnp.uint32)))
+    actions = jnp.concatenate([switched(rng, draw, robots) for draw in (uniform, bang_bang)])
+    ours = jax.device_get(drive(here, actions))
+    first = jax.device_get(jax.jit(jax.vmap(env.reset))(jnp.zeros((2 * robots, 2), jnp.uint32)))
     first = first.pipeline_state
     ctrl = np.asarray(jax.vmap(jax.vmap(env.wheel_targets))(actions)).swapaxes(0, 1)
     substeps = env.config.physics.n_substeps
@@ -167,14 +175,13 @@ def test_mjx_follows_c_mujoco(driver, on_floor):
         assert p95 < SLIPPERY_P95
         # Two counts of rare events: their difference deviates by the root of their sum.
         assert astray - allowed <= 3 * math.sqrt(astray + allowed)
-    single_steps_agree(case, env, mjx_model, theirs, ctrl)
+    single_steps_agree(case, here, theirs, ctrl)
 
 
-def single_steps_agree(case, env, mjx_model, theirs, ctrl):
+def single_steps_agree(case, env, theirs, ctrl):
     """Check single control steps, from each state of the converged path to the next one."""
     states = jax.tree.map(lambda x: jnp.float32(x[:-1].reshape(-1, *x.shape[2:])), theirs)
-    step = env.with_model(mjx_model).physics.step
-    ahead = jax.jit(jax.vmap(step))(states, ctrl[1:].reshape(-1, 2))
+    ahead = jax.jit(jax.vmap(env.physics.step))(states, ctrl[1:].reshape(-1, 2))
     error = np.asarray(ahead.qvel) - theirs.qvel[1:].reshape(ahead.qvel.shape)
     error = np.linalg.norm(error[:, :3], axis=-1)
     outliers = np.flatnonzero(error > STEP_OUTLIER)
@@ -183,19 +190,22 @@ def single_steps_agree(case, env, mjx_model, theirs, ctrl):
         f" {len(outliers)} of {len(error):,} above {STEP_OUTLIER}"
     )
     for index in outliers:
-        before, robot = divmod(index, 2 * ROBOTS)
+        before, robot = divmod(index, ctrl.shape[1])
         print(f"  robot {robot}, control step {before + 1}: {error[index]:.1e} m/s")
     assert np.quantile(error, 0.999) < STEP_TOLERANCE
     assert len(outliers) <= len(error) / 10_000
 
 
+@pytest.mark.parametrize(
+    "driver", [pytest.param("isaac", marks=pytest.mark.slow), "real"], indirect=True
+)
 def test_straight_driving_and_spinning_match_closed_form(driver):
     env, drive = driver
     limits = {"max_speed": 1.0, "max_yaw_rate": math.pi}
     speed = 1.0 if env.robot.max_wheel_speed is None else 0.4
     twists = jnp.array([[speed, 0.0], [0.0, math.pi], [0.0, -1.0]])
     actions = jax.vmap(lambda twist: kinematics.action_from_twist(twist, **limits))(twists)
-    physics = drive(env.mjx_model, jnp.repeat(actions[:, None], STEPS, axis=1))
+    physics = drive(env, jnp.repeat(actions[:, None], STEPS, axis=1))
     velocity = np.asarray(physics.qvel[120:]).mean(axis=0)  # after the motors' run-up
     geometry = {
         "wheel_radius": robot_model.WHEEL_RADIUS,
@@ -216,17 +226,26 @@ def test_straight_driving_and_spinning_match_closed_form(driver):
     np.testing.assert_allclose(velocity[2, 5], expected[2, 1], rtol=CLOSED_FORM_TOLERANCE)
 
 
-@pytest.mark.parametrize("friction", [1.0, 0.4])
+@pytest.mark.parametrize(
+    ("driver", "friction"),
+    [
+        ("isaac", 0.4),
+        ("real", 1.0),
+        pytest.param("isaac", 1.0, marks=pytest.mark.slow),
+        pytest.param("real", 0.4, marks=pytest.mark.slow),
+    ],
+    indirect=["driver"],
+)
 def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     env, drive = driver
     robot = dataclasses.replace(env.robot, friction=friction)
     mjx_model = mjx.put_model(make_mj_model(robot, env.config.physics, visual=False))
     rng = np.random.default_rng(1)
     actions = jnp.concatenate([held(rng, bang_bang, 64, hold) for hold in (4, 8, 16, 32)])
-    physics = drive(mjx_model, actions)
+    physics = drive(env.with_model(mjx_model), actions)
     assert np.all(np.isfinite(physics.qpos))
     assert np.all(np.isfinite(physics.qvel))
-    tilt = np.degrees(jax.vmap(jax.vmap(motion.tilt))(physics.qpos[:, :, 3:7]).max())
+    tilt = np.degrees(jax.jit(jax.vmap(jax.vmap(motion.tilt)))(physics.qpos[:, :, 3:7]).max())
     print(f"\n{env.config.robot.preset}, friction {friction}: worst tilt {tilt:.2f}°")
     assert tilt < WORST_TILT
 
@@ -235,7 +254,14 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     (gpu if jax.default_backend() == "gpu" else cpu).obstacle() is not None,
     reason="XLA takes no kernels here",
 )
-def test_another_solver_is_another_kernel():
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("iterations",),
+        pytest.param(("ls_iterations", "tolerance"), marks=pytest.mark.slow),
+    ],
+)
+def test_another_solver_is_another_kernel(names):
     # The number of iterations is not among the arrays of MJX's model, so that a key made of the
     # arrays alone would be the same.
     env = make_env(parse_config({}))
@@ -252,8 +278,9 @@ def test_another_solver_is_another_kernel():
 
     plain = kernels()
     assert kernels() == plain
-    others = [{"iterations": 3}, {"ls_iterations": 3}, {"tolerance": option.tolerance * 10}]
-    assert len({plain, *(kernels(**changed) for changed in others)}) == 4
+    changed = {"iterations": 3, "ls_iterations": 3, "tolerance": option.tolerance * 10}
+    others = (kernels(**{name: changed[name]}) for name in names)
+    assert len({plain, *others}) == 1 + len(names)
 
 
 def test_physics_keeps_full_precision_in_its_matrix_products():

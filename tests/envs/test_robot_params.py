@@ -1,6 +1,7 @@
 """Robots with changed parameters against C MuJoCo, closed-form solutions, and the preset."""
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -43,13 +44,13 @@ def straight(steps, drive):
     return jnp.broadcast_to(jnp.array([drive, 0.0]), (ROBOTS, steps, 2))
 
 
-@pytest.fixture(scope="module", params=["isaac", "real"])
-def driver(request):
+@functools.cache
+def make_driver(preset):
     """An environment and a compiled `(robot_params (n,), actions (n, t, 2)) -> (physics, targets)`.
 
     Without a robot_params it drives the environment itself.
     """
-    env = make_env(parse_config({"robot": {"preset": request.param}}))
+    env = make_env(parse_config({"robot": {"preset": preset}}))
 
     def drive(robot_params, actions):
         def one(robot_params, actions):
@@ -67,6 +68,11 @@ def driver(request):
         return jax.vmap(one)(robot_params, actions)
 
     return env, jax.jit(drive, compiler_options=compiler_options(env.config.deterministic))
+
+
+@pytest.fixture(params=["isaac", "real"])
+def driver(request):
+    return make_driver(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +112,9 @@ def test_without_a_difference_the_robot_is_its_preset_to_the_bit(driver):
     jax.tree.map(np.testing.assert_array_equal, varied(RobotParams()), env.mjx_model)
 
 
+@pytest.mark.parametrize(
+    "driver", [pytest.param("isaac", marks=pytest.mark.slow), "real"], indirect=True
+)
 def test_without_a_difference_the_robot_drives_as_its_preset(driver, actions):
     """Not to the bit: where a number is known, a kernel has done its arithmetic beforehand."""
     _, drive = driver

@@ -91,8 +91,9 @@ def test_each_look_is_constant_in_an_episode_and_another_one_in_each(drawn, rang
 
 def test_looks_do_not_change_the_goals(drawn):
     first = make_env(make_config({}))
+    goals = jax.jit(jax.vmap(lambda key: first.reset(key).goal))
     keys = jax.random.split(jax.random.PRNGKey(7), ENVS)
-    np.testing.assert_array_equal(drawn.goal[0], jax.vmap(first.reset)(keys).goal)
+    np.testing.assert_array_equal(drawn.goal[0], goals(keys))
 
 
 def test_an_image_is_that_of_its_looks(drawn, ranges):
@@ -115,16 +116,19 @@ def test_an_image_is_that_of_its_looks(drawn, ranges):
     assert np.abs(difference).max() > 1
 
 
+@pytest.fixture(scope="module")
+def plain():
+    """The plain image of every state, without delay."""
+    return episodes(make_config({}, length=60), 4, 40).obs[PIXELS]
+
+
 def late(**randomization):
     states = episodes(make_config(randomization, length=60), 4, 40)
-    camera = states.episode_params.camera
-    # The plain image of every state, without delay.
-    plain = episodes(make_config({}, length=60), 4, 40).obs[PIXELS]
-    return states.obs[PIXELS], plain, camera
+    return states.obs[PIXELS], states.episode_params.camera
 
 
-def test_a_delay_gives_the_image_of_so_many_steps_ago():
-    seen, plain, camera = late(camera_delay=[0, 3])
+def test_a_delay_gives_the_image_of_so_many_steps_ago(plain):
+    seen, camera = late(camera_delay=[0, 3])
     delays = camera.values["camera_delay"][0].astype(int)
     for robot, delay in enumerate(delays):
         for step in range(len(seen)):
@@ -133,14 +137,14 @@ def test_a_delay_gives_the_image_of_so_many_steps_ago():
     assert len(np.unique(plain[:, 0], axis=0)) > 20
 
 
-def test_between_two_images_the_last_one_stays():
-    seen, plain, _ = late(camera_interval=[3, 3])
+def test_between_two_images_the_last_one_stays(plain):
+    seen, _ = late(camera_interval=[3, 3])
     for step in range(len(seen)):
         np.testing.assert_array_equal(seen[step], plain[step - step % 3])
 
 
-def test_lost_images_leave_the_one_before_and_are_as_many_as_drawn():
-    seen, plain, camera = late(frame_drop=[0.3, 0.3], pixel_noise=[0.1, 0.1])
+def test_lost_images_leave_the_one_before_and_are_as_many_as_drawn(plain):
+    seen, camera = late(frame_drop=[0.3, 0.3], pixel_noise=[0.1, 0.1])
     times = camera.seen.time
     lost = times[1:] == times[:-1]
     assert lost.mean() == pytest.approx(0.3, abs=0.09)  # 160 draws
@@ -159,11 +163,12 @@ def test_nothing_drawn_of_the_looks_leaves_the_camera_as_it_was():
 
 def test_fixed_looks_are_those_of_every_episode():
     env = make_env(make_config({}))
-    plain = env.reset(report_keys(1)[0]).obs[PIXELS].astype(float)
+    key = report_keys(1)[0]
+    plain = jax.jit(env.reset)(key).obs[PIXELS].astype(float)
     darker = with_camera(
         DomainRandomizationWrapper(env, look_params=LookParams(exposure=0.5)), env.camera
     )
-    image = np.asarray(darker.reset(report_keys(1)[0]).obs[PIXELS]).astype(float)
+    image = np.asarray(jax.jit(darker.reset)(key).obs[PIXELS]).astype(float)
     np.testing.assert_allclose(image, 0.5 * plain, atol=1)
 
 

@@ -14,6 +14,11 @@ from jetbot_mjx.errors import InvalidError
 JETBOT = {"width": 224, "height": 224, "matrix": (114.0, 113.0, 113.5, 110.0)}
 """A wide lens: 160 degrees from corner to corner, as calibrations of JetBots give it."""
 
+HALF = {"width": 112, "height": 112, "matrix": (57.0, 56.5, 56.5, 54.75)}
+"""The same lens, with pixels of twice the size."""
+
+RADIAL = {"lens": "opencv", "distortion": (-0.05, 0.01)}
+
 
 def _whole(config, rays):
     shape = config.height, config.width
@@ -69,13 +74,22 @@ def pixels_of(config, rays, matrix):
         JETBOT,
         JETBOT | {"lens": "fisheye"},
         JETBOT | {"lens": "fisheye", "distortion": (-0.02, 0.01, -0.004, 0.0005)},
-        JETBOT | {"lens": "opencv", "distortion": (-0.05, 0.01)},
+        HALF | RADIAL,
+        pytest.param(JETBOT | RADIAL, marks=pytest.mark.slow),
         {"width": 64, "height": 48, "matrix": (60.0, 61.0, 30.0, 25.0), "lens": "opencv"}
         | {"distortion": (-0.3, 0.1, 0.002, -0.003, -0.02)},
         {"width": 64, "height": 48, "matrix": (60.0, 61.0, 30.0, 25.0), "lens": "opencv"}
         | {"distortion": (0.5, 0.2, 0.001, 0.001, 0.02, 0.6, 0.3, 0.05)},
     ],
-    ids=["pinhole", "equidistant", "fisheye", "radial", "tangential", "rational"],
+    ids=[
+        "pinhole",
+        "equidistant",
+        "fisheye",
+        "radial",
+        "radial of many pixels",
+        "tangential",
+        "rational",
+    ],
 )
 def test_every_pixel_comes_back(camera):
     config = CameraConfig(**camera)

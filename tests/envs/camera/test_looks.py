@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,22 @@ HEIGHT = 0.0325  # [m] of the axle midpoint
 CUBE = np.array([0.5, 0.0, 0.05])
 LATE = ("camera_delay", "camera_interval", "frame_drop")
 PLACED = ("walls", "clutter")  # need surroundings to show anything
+NAMES = [n for n in LookParams._fields if n not in (*LATE, *PLACED, "pixel_noise")]
+# Of looks that the renderer asks for together, as of a colour's red and blue, one in each of these.
+PROGRAMS = (
+    (
+        *("cube_brightness", "floor_brightness", "sky_brightness", "light", "camera_x"),
+        *("camera_pitch", "cube_yaw", "floor_contrast", "exposure", "focal_length"),
+    ),
+    (
+        *("cube_red", "floor_red", "sky_red", "light_x", "camera_y"),
+        *("camera_roll", "floor_texture", "floor_scale", "red_gain", "blur"),
+    ),
+    (
+        *("cube_blue", "floor_blue", "sky_blue", "light_y", "camera_z"),
+        *("camera_yaw", "floor_yaw", "ambient", "blue_gain", "distortion"),
+    ),
+)
 TOGETHER = LookParams(
     cube_brightness=0.8,
     cube_red=1.1,
@@ -59,9 +76,13 @@ TOGETHER = LookParams(
 
 @dataclasses.dataclass
 class Eye:
-    """A camera on a robot at the origin, and a cube half a metre ahead of it."""
+    """A camera on a robot at the origin, and a cube half a metre ahead of it.
+
+    Looks of one of its programs are data together: what is compiled for one of them serves all.
+    """
 
     camera: Camera
+    programs: tuple[tuple[str, ...], ...] = PROGRAMS
 
     def see(self, surroundings=PLAIN.surroundings, *, cube=CUBE, **looks):
         params = LookParams(**looks)
@@ -69,8 +90,10 @@ class Eye:
 
     def see_all(self, appearance, cube=CUBE):
         params = appearance.params
-        differ = {name: x for name, x in params._asdict().items() if params.differs(name)}
-        return np.asarray(self._render(differ, appearance.surroundings, jnp.asarray(cube)))
+        differ = {name for name in params._fields if params.differs(name)}
+        traced = differ.union(*(names for names in self.programs if differ & {*names}))
+        values = {name: np.float32(getattr(params, name)) for name in sorted(traced)}
+        return np.asarray(self._render(values, appearance.surroundings, np.float32(cube)))
 
     @functools.cached_property
     def _render(self):
@@ -82,15 +105,38 @@ class Eye:
 
         return render
 
+    def draw(self, objects=4, key=0):
+        """Walls and objects around the robot."""
+        return self._draw(objects, jax.random.PRNGKey(key))
+
+    @functools.cached_property
+    def _draw(self):
+        @functools.partial(jax.jit, static_argnums=0)
+        def draw(objects, key):
+            params = LookParams(walls=jnp.float32(0.4), clutter=jnp.float32(objects))
+            return draw_surroundings(key, params, objects, self.camera.scene, jnp.asarray(CUBE))
+
+        return draw
+
+
+@functools.cache
+def mj_model():
+    return make_env(Config()).mj_model
+
 
 def make_eye(**camera):
     settings = {"width": SIDE, "height": SIDE, "fovy": 90.0, "pitch": 0.0} | camera
-    return Eye(Camera(CameraConfig(**settings), make_env(Config()).mj_model))
+    return Eye(Camera(CameraConfig(**settings), mj_model()))
 
 
 @pytest.fixture(scope="module")
 def eye():
     return make_eye()
+
+
+@pytest.fixture(scope="module")
+def eye_far_above():
+    return make_eye(pitch=90.0, position=(0.26, 0.26, 2.5), samples=1)
 
 
 @pytest.fixture(scope="module")
@@ -114,20 +160,30 @@ def test_plain_looks_are_the_plain_image_to_the_bit_and_its_kernel(eye):
     assert len(set(eye.camera.kernel_impl.kernels) | kernels) == 1
 
 
-NAMES = [n for n in LookParams._fields if n not in (*LATE, *PLACED, "pixel_noise")]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_only_another_value_than_the_plain_one_changes_the_image(eye, name):
-    """Both as data of the image, and not as constants of the kernel."""
+def only_another_value_changes_the_image(eye, names):
+    """Check looks one by one, as data of the image and not as constants of the kernel."""
     cube = (0.5, 0.1, 0.05)
     plain = eye.see(cube=cube).astype(int)
-    same, other = (
-        eye.see(cube=cube, **{name: jnp.float32(getattr(params, name))})
-        for params in (LookParams(), TOGETHER)
-    )
-    assert np.abs(same - plain).max() <= 1
-    assert (np.abs(other - plain) > 1).sum() > 8
+    same = {name: jnp.float32(getattr(LookParams(), name)) for name in names}
+    assert np.abs(eye.see(cube=cube, **same) - plain).max() <= 1
+    for name in names:
+        other = eye.see(cube=cube, **same | {name: jnp.float32(getattr(TOGETHER, name))})
+        assert (np.abs(other - plain) > 1).sum() > 8, name
+
+
+@pytest.mark.parametrize("names", PROGRAMS, ids=["brightness", "red", "blue"])
+def test_only_another_value_than_the_plain_one_changes_the_image(eye, names):
+    only_another_value_changes_the_image(eye, names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_a_look_that_alone_is_data_changes_the_image(eye, name):
+    only_another_value_changes_the_image(Eye(eye.camera, programs=()), [name])
+
+
+def test_every_look_of_a_pixel_is_data_of_one_program():
+    assert sorted(itertools.chain(*PROGRAMS)) == sorted(NAMES)
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -169,9 +225,9 @@ def test_contrast_is_about_the_mean_of_the_two_colours(eye, plain):
 
 
 @pytest.mark.parametrize("texture", range(4))
-def test_a_texture_has_its_pattern(texture):
-    """Seen from far above: how many colours there are, and in which directions they change."""
-    eye = make_eye(pitch=90.0, position=(0.26, 0.26, 2.5), samples=1)
+def test_a_texture_has_its_pattern(eye_far_above, texture):
+    """How many colours there are, and in which directions they change."""
+    eye = eye_far_above
     image = eye.see(floor_texture=texture, floor_contrast=1.5, cube=(0, 0, -5.0))
     image = image[..., 0].astype(int)
     dark = (image < 0.5 * (image.min() + image.max())).mean()
@@ -277,15 +333,8 @@ def test_light_brightens_only_where_it_shines(eye, plain):
     assert behind[CUBE_PLACE][..., 0].mean() > 1.3 * ahead[CUBE_PLACE][..., 0].mean()
 
 
-def some(eye, objects=4, key=0):
-    params = LookParams(walls=jnp.float32(0.4), clutter=jnp.float32(objects))
-    return draw_surroundings(
-        jax.random.PRNGKey(key), params, objects, eye.camera.scene, jnp.asarray(CUBE)
-    )
-
-
 def test_walls_stand_at_their_distance_and_hide_nothing_before_them(eye, plain):
-    walls = some(eye)._replace(clutter=None)
+    walls = eye.draw()._replace(clutter=None)
     straight = walls._replace(walls=walls.walls.at[0].set(0.0).at[1].set(1.0))
     np.testing.assert_array_equal(eye.see(straight, walls=jnp.float32(0.0)), plain)
     distance, above = 1 / 0.4 - 0.018, HEIGHT + 0.059
@@ -302,7 +351,7 @@ def test_objects_stand_around_and_look_like_no_goal(eye, plain):
     seen, places = 0, []
     nominal = np.asarray(next(g.rgb for g in eye.camera.scene.geoms if g.mocap == GOAL))
     for key in range(24):
-        around = some(eye, key=key)._replace(walls=None)
+        around = eye.draw(key=key)._replace(walls=None)
         clutter = np.asarray(around.clutter)
         places.append(clutter[:, :2])
         hues = clutter[:, 2:] - clutter[:, 2:].mean(-1, keepdims=True)
@@ -319,7 +368,15 @@ def test_objects_stand_around_and_look_like_no_goal(eye, plain):
     assert np.linalg.norm(places - CUBE[:2], axis=-1).min() >= 0.25
 
 
-@pytest.mark.parametrize("camera", [{}, {"colour": "grey"}, {"lens": "fisheye"}])
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {},
+        {"colour": "grey", "lens": "fisheye"},
+        pytest.param({"colour": "grey"}, marks=pytest.mark.slow),
+        pytest.param({"lens": "fisheye"}, marks=pytest.mark.slow),
+    ],
+)
 def test_the_kernel_draws_what_xla_draws_with_everything_drawn(camera):
     images = []
     for impl in ("auto", "xla"):
@@ -327,7 +384,7 @@ def test_the_kernel_draws_what_xla_draws_with_everything_drawn(camera):
         traced = LookParams(*map(jnp.float32, TOGETHER))._replace(
             **{name: getattr(LookParams(), name) for name in (*LATE, "pixel_noise")}
         )
-        images.append(eye.see_all(Appearance(traced, some(eye, key=3))).astype(int))
+        images.append(eye.see_all(Appearance(traced, eye.draw(key=3))).astype(int))
         assert any(eye.camera.kernel_impl.kernels.values()) == (impl == "auto")
     difference = np.abs(images[0] - images[1])
     assert difference.max() <= 1 or (difference > 1).mean() < 2e-3
@@ -336,7 +393,8 @@ def test_the_kernel_draws_what_xla_draws_with_everything_drawn(camera):
 
 def test_noise_has_its_deviation_is_white_and_another_one_in_every_image():
     grey = jnp.full((64, 64, 3), 128, jnp.uint8)
-    noisy = [np.asarray(add_noise(grey, 0.05, jnp.uint32(seed))).astype(float) for seed in range(8)]
+    add = jax.jit(add_noise)
+    noisy = [np.asarray(add(grey, 0.05, jnp.uint32(seed))).astype(float) for seed in range(8)]
     noise = np.stack(noisy) - 128
     assert noise.mean() == pytest.approx(0.0, abs=0.2)
     assert noise.std() == pytest.approx(0.05 * 255, rel=0.02)
@@ -345,4 +403,4 @@ def test_noise_has_its_deviation_is_white_and_another_one_in_every_image():
     for axis in (1, 2, 3):
         shifted = np.roll(noise, 1, axis)
         assert abs((noise * shifted).mean() / noise.var()) < 0.02
-    np.testing.assert_array_equal(add_noise(grey, 0.0, jnp.uint32(1)), grey)
+    np.testing.assert_array_equal(add(grey, 0.0, jnp.uint32(1)), grey)
