@@ -83,7 +83,7 @@ def driven(request):
 def drive(env, targets):
     """Where robots end after targets (t, n, 2), each held for 16 steps."""
 
-    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
+    @jax.jit
     def run(states, targets):
         step = jax.vmap(env.physics.step)
 
