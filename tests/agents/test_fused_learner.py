@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import re
 
 import jax
@@ -11,6 +12,7 @@ import pytest
 from brax.training.agents.ppo.networks import PPONetworks
 
 from helpers import simt
+from helpers.further import slow_unless
 from helpers.kernel_ppo import ACTIONS, OBSERVATIONS, config, make_ppo, minibatch
 from jetbot_mjx.agents.fused import launch, launch_gpu, probe
 from jetbot_mjx.agents.fused.arrays import ACTIONS as ACTION_ARRAYS
@@ -232,8 +234,14 @@ def test_actions_of_other_shapes_are_refused(wrong):
         launch.actions(shape, *arrays)
 
 
-@pytest.mark.parametrize("normalizes", [True, False])
-@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
+# Both distributions, and both with and without a normaliser, are in two quick ones of the four.
+NORMALIZED = slow_unless(
+    lambda distribution, normalizes: normalizes == (distribution == "tanh_normal"),
+    itertools.product(["tanh_normal", "normal"], [True, False]),
+)
+
+
+@pytest.mark.parametrize(("distribution", "normalizes"), NORMALIZED)
 def test_what_a_collection_keeps_is_as_brax_has_it(distribution, normalizes):
     settings = config(
         network={"distribution_type": distribution}, normalize_observations=normalizes
@@ -360,8 +368,7 @@ def test_the_probe_agrees():
 
 
 @pytest.mark.cpu
-@pytest.mark.parametrize("normalizes", [True, False])
-@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
+@pytest.mark.parametrize(("distribution", "normalizes"), NORMALIZED)
 def test_the_models_gradient_is_xlas(monkeypatch, distribution, normalizes):
     monkeypatch.setattr(launch, "gradient", modelled)
     settings = config(
@@ -521,9 +528,16 @@ def modelled_adam(rule, *arrays):
     return jax.pure_callback(run, like, *arrays)
 
 
+# Of every schedule, one distribution.
+QUICK_SCHEDULES = {"NONE": "normal", "LINEAR": "tanh_normal", "ADAPTIVE_KL": "tanh_normal"}
+SCHEDULED = slow_unless(
+    lambda schedule, distribution: distribution == QUICK_SCHEDULES[schedule],
+    itertools.product(SCHEDULES, ["tanh_normal", "normal"]),
+)
+
+
 @pytest.mark.parametrize("compute", [launch.adam, modelled_adam], ids=["kernel", "model"])
-@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
-@pytest.mark.parametrize("schedule", SCHEDULES)
+@pytest.mark.parametrize(("schedule", "distribution"), SCHEDULED)
 def test_adam_is_that_of_optax(schedule, distribution, compute):
     """Six minibatches after two of another training step, of which one has no finite gradient."""
     settings = config(
@@ -602,9 +616,15 @@ def test_adam_serves_several_policies_at_once():
 
 
 @pytest.mark.cpu
-@pytest.mark.parametrize("schedule", SCHEDULES)
-@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
-@pytest.mark.parametrize("policies", [1, 3])
+@pytest.mark.parametrize(
+    ("policies", "distribution", "schedule"),
+    slow_unless(
+        lambda policies, distribution, schedule: (
+            distribution == QUICK_SCHEDULES[schedule] and (policies == 3) == (schedule != "LINEAR")
+        ),
+        itertools.product([1, 3], ["tanh_normal", "normal"], SCHEDULES),
+    ),
+)
 def test_a_cpu_computes_all_minibatches_at_once_as_one_by_one(policies, distribution, schedule):
     settings = config(
         num_minibatches=3,

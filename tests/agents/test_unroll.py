@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from brax.envs import Wrapper
 
+from helpers.further import slow_unless
 from helpers.gliding import Gliding
 from jetbot_mjx.agents.fused import launch
 from jetbot_mjx.agents.fused.arrays import UNROLL
@@ -74,7 +75,11 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+# The steps of both are among those of the quick cases, and so are several parts and policies.
+FURTHER = "jetbot", "egocentric", "more than a part"
+
+
+@pytest.mark.parametrize("case", slow_unless(lambda case: case not in FURTHER, CASES))
 def test_an_unroll_is_its_steps_one_by_one(root, monkeypatch, case):
     name, envs, policies, overrides, env = CASES[case]
     ppo = built(root, name, *overrides, envs=envs, env=env)

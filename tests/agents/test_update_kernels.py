@@ -1,6 +1,7 @@
 """The kernels of PPO's update: their text is executed by a model of a GPU, and LLVM compiles it."""
 
 import functools
+import itertools
 import re
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers import simt
+from helpers.further import slow_unless
 from helpers.update_cases import (
     CASES,
     COUNT,
@@ -34,13 +36,20 @@ from onekernel import cpu, gpu
 pytest.importorskip("llvmlite")
 
 
+WARPS, SWISH = "a warp for 16 rows", "swish, advantages as they are"
+
+
 def drawn(shape, environments):
     """The shapes of `launch.Actions`."""
     shapes = signatures.ACTIONS.shapes(shape, Minibatch(environments=environments))
     return [shapes[name] for name in launch.Actions._fields]
 
 
-@pytest.mark.parametrize("name", CASES)
+# Three layers of tanh are among the quick ones, and so are tiles of every other size.
+FURTHER_ADVANTAGES = "three layers of 128", "four layers, small tiles", SWISH
+
+
+@pytest.mark.parametrize("name", slow_unless(lambda name: name not in FURTHER_ADVANTAGES, CASES))
 def test_the_advantages_are_those_of_float64(name):
     case = CASES[name]
     made = [make_data(case, seed) for seed in range(case.seeds)]
@@ -61,7 +70,7 @@ def test_the_advantages_are_those_of_float64(name):
         np.testing.assert_allclose(parts.sum(0), [advantage.sum(), squares], rtol=1e-4, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_unless(lambda name: name != WARPS, CASES))
 def test_the_gradient_is_that_of_float64(name):
     case = CASES[name]
     made = [make_data(case, seed) for seed in range(case.seeds)]
@@ -96,9 +105,22 @@ CPU_CASES = {
 }
 
 
+# By the number of lanes: every network on this processor, and every activation on another.
+QUICK_LANES = {
+    None: [name for name in CPU_CASES if name != WARPS],
+    8: ("three layers of 128", "two seeds, one step"),
+    4: ("48 units", "80 units, normal"),
+}
+
+
 @pytest.mark.cpu
-@pytest.mark.parametrize(("lanes", "registers"), [(None, None), (8, 16), (4, 32)])
-@pytest.mark.parametrize("name", CPU_CASES)
+@pytest.mark.parametrize(
+    ("name", "lanes", "registers"),
+    slow_unless(
+        lambda name, lanes, _: name in QUICK_LANES[lanes],
+        [(name, *host) for name in CPU_CASES for host in [(None, None), (8, 16), (4, 32)]],
+    ),
+)
 def test_the_gradient_on_a_cpu_is_that_of_float64(name, lanes, registers, monkeypatch):
     if lanes is not None:
         host = cpu.host_processor()._replace(lanes=lanes, registers=registers)
@@ -143,8 +165,18 @@ def test_it_says_what_a_cpu_cannot_compute(shape, batch, reason):
     assert reason in launch_cpu.refusal(shape, batch)
 
 
-@pytest.mark.parametrize("rows", [32, 64, 256])
-@pytest.mark.parametrize("name", CASES)
+# Of every network the tiles of one size, and of one network those of two sizes.
+QUICK_ROWS = {
+    32: ("48 units", "four layers, small tiles", SWISH),
+    64: ("three layers of 128", "two seeds, one step"),
+    256: ("48 units", "80 units, normal"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "rows"),
+    slow_unless(lambda name, rows: name in QUICK_ROWS[rows], itertools.product(CASES, QUICK_ROWS)),
+)
 def test_the_actions_are_those_of_float64(name, rows):
     shape, environments = CASES[name].shape, 2 * rows + 23
     made = [make_actions(shape, environments, seed) for seed in range(2)]
@@ -160,9 +192,22 @@ def test_the_actions_are_those_of_float64(name, rows):
         assert_are_actions([x[i] for x in results], shape, expected, 0.02)
 
 
+# Of every network one number of environments, and of one network two.
+QUICK_ENVIRONMENTS = {
+    1: ("48 units", "four layers, small tiles", "two seeds, one step"),
+    150: ("48 units", "three layers of 128", "80 units, normal", "a layer of 256"),
+    4100: ("several parts", SWISH),
+}
+
+
 @pytest.mark.cpu
-@pytest.mark.parametrize("environments", [1, 150, 4100])
-@pytest.mark.parametrize("name", CPU_CASES)
+@pytest.mark.parametrize(
+    ("name", "environments"),
+    slow_unless(
+        lambda name, environments: name in QUICK_ENVIRONMENTS[environments],
+        itertools.product(CPU_CASES, QUICK_ENVIRONMENTS),
+    ),
+)
 def test_the_actions_on_a_cpu_are_those_of_float64(name, environments):
     shape = CPU_CASES[name].shape
     made = [make_actions(shape, environments, seed) for seed in range(2)]
@@ -205,8 +250,13 @@ def test_a_tile_of_actions_fills_the_gpu(environments, memory, rows):
     assert gpu_tiling.best_tiling("actions", shape, batch, 132, memory).rows == rows
 
 
-@pytest.mark.parametrize("architecture", [80, 90])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    ("name", "architecture"),
+    slow_unless(
+        lambda name, architecture: architecture == 90 or name in ("48 units", SWISH),
+        itertools.product(CASES, [80, 90]),
+    ),
+)
 def test_llvm_compiles_them(name, architecture):
     case = CASES[name]
     others = (Tiling(case.shape, 64, 1, purpose) for purpose in ("advantages", "actions"))

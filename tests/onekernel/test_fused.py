@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.further import slow_unless
 from helpers.small_kernels import launches, launches_in, lowered_text
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
@@ -197,7 +198,11 @@ LONG_SCANS = {
 }
 
 
-@pytest.mark.parametrize("name", LONG_SCANS)
+# Sums are in "rows that are results, too", and rows read backwards in "several dtypes".
+FURTHER_SCANS = "cumulative sums", "a derivative"
+
+
+@pytest.mark.parametrize("name", slow_unless(lambda name: name not in FURTHER_SCANS, LONG_SCANS))
 def test_a_long_scan_is_one_kernel(name):
     function, *arguments = LONG_SCANS[name]
     batched = jax.vmap(fuse(function))
@@ -683,7 +688,9 @@ def drive_all(state, step, spoil):
     return jax.device_get(states)
 
 
-@pytest.fixture(scope="module", params=["smoke", "jetbot", "real_jetbot"])
+@pytest.fixture(
+    scope="module", params=["smoke", pytest.param("jetbot", marks=pytest.mark.slow), "real_jetbot"]
+)
 def driven(request, root):
     """What became of robots whose steps are one kernel, and many."""
     batch, one = environment(request.param, root)
@@ -746,7 +753,7 @@ def test_all_numbers_of_environments_are_those_of_many_kernels(driven):
         np.testing.assert_allclose(one, other, rtol=0, atol=atol, err_msg=field)
 
 
-@pytest.mark.parametrize("name", ["smoke", "real_jetbot"])
+@pytest.mark.parametrize("name", [pytest.param("smoke", marks=pytest.mark.slow), "real_jetbot"])
 def test_a_step_of_an_environment_is_one_kernel_and_a_reset_another(name, root):
     batch, one = environment(name, root)
     keys = jax.random.split(jax.random.PRNGKey(0), ENVS)

@@ -647,7 +647,7 @@ def test_the_arithmetic_of_mjx_is_mjxs_own(env):
     def step(physics, ctrl):
         return env.physics.substep(physics, (ctrl, []))
 
-    first = env.reset(jax.random.PRNGKey(0)).pipeline_state
+    first = jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state
     program = jaxpr.scalarize(step, first, jnp.zeros(2))
     rng = np.random.default_rng(0)
     robots = 16
