@@ -24,7 +24,11 @@ PATIENCE = 300
 
 INTERVAL = 8_192
 """Environment steps between two checkpoints: two training steps."""
-SETTINGS = (*torture.SETTINGS, f"checkpoint_interval={INTERVAL}")
+SETTINGS = (
+    *torture.SETTINGS,
+    f"checkpoint_interval={INTERVAL}",
+    f"ppo.num_timesteps={4 * INTERVAL}",
+)
 
 TRAINER = gliding.program("train")
 
