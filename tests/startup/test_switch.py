@@ -65,10 +65,11 @@ TRAIN_AND_EVALUATE = """
 import json, sys
 from helpers import gliding
 from helpers.command_modules import evaluate, train
+from helpers.unpainted import unpainted
 from jetbot_mjx import cli
 
 training, evaluation = map(json.loads, sys.argv[1:])
-with gliding.everywhere():
+with gliding.everywhere(), unpainted():
     cli.run_command(lambda _: train.main(training) or evaluate.main(evaluation), at_once=True)
 """
 
