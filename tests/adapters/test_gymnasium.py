@@ -299,20 +299,28 @@ def test_a_picture_shows_the_robot_where_it_is(needs_opengl):
     env.close()
 
 
-def test_an_environment_that_is_not_closed_prints_nothing_at_exit(needs_opengl):
-    told = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            "from jetbot_mjx.adapters import JetBotGymEnv\n"
-            "env = JetBotGymEnv(render_mode='rgb_array')\n"
-            "env.reset()\n"
-            "print(env.render().shape)",
-        ],
-        capture_output=True,
-        text=True,
-    )
-    assert (told.returncode, told.stdout, told.stderr) == (0, "(480, 480, 3)\n", "")
+@pytest.fixture(scope="module")
+def fresh_process():
+    """A process that makes the environment by its name, draws it, and does not close it."""
+    program = f"""
+import gymnasium
+env = gymnasium.make({ID!r}, render_mode="rgb_array").unwrapped
+print(env.spec.id, flush=True)
+env.reset()
+print(env.render().shape)
+"""
+    command = [sys.executable, "-W", "ignore", "-c", program]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_gymnasium_finds_the_environment_in_a_fresh_process(fresh_process):
+    assert fresh_process.stdout.startswith("JetBot-v0\n"), fresh_process.stderr[-2000:]
+
+
+def test_an_environment_that_is_not_closed_prints_nothing_at_exit(needs_opengl, fresh_process):
+    told = fresh_process
+    assert (told.returncode, told.stderr) == (0, "")
+    assert told.stdout == "JetBot-v0\n(480, 480, 3)\n"
 
 
 def test_a_window_follows_the_robot_in_real_time(window):
@@ -368,10 +376,3 @@ def test_gymnasiums_checker_passes_with_images(observation):
     assert batch.observation_space.contains(obs)
     obs, *_ = batch.step(np.zeros((2, 2), np.float32))
     assert batch.observation_space.contains(obs)
-
-
-def test_gymnasium_finds_the_environment_in_a_fresh_process():
-    program = f"import gymnasium; print(gymnasium.make({ID!r}).spec.id)"
-    command = [sys.executable, "-W", "ignore", "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, "JetBot-v0\n"), done.stderr[-2000:]

@@ -80,10 +80,11 @@ def test_its_checker_passes():
 
 
 @pytest.mark.parametrize(
-    "steps", [pytest.param(2560), pytest.param(20_000, marks=pytest.mark.slow)], ids=str
+    ("steps", "shorter"),
+    [(1024, {"n_steps": 512}), pytest.param(20_000, {}, marks=pytest.mark.slow)],
 )
-def test_its_ppo_learns_with_the_tutorials_hyperparameters(steps):
-    ppo = sb3.PPO("MlpPolicy", JetBotGymEnv(), seed=0, **TUTORIAL)
+def test_its_ppo_learns_with_the_tutorials_hyperparameters(steps, shorter):
+    ppo = sb3.PPO("MlpPolicy", JetBotGymEnv(), seed=0, **TUTORIAL | shorter)
     before = [x.detach().clone() for x in ppo.policy.parameters()]
     ppo.learn(steps)
     assert ppo.num_timesteps >= steps

@@ -367,7 +367,7 @@ plt.figure()
 before = state()
 with gliding.everywhere(), unpainted.unpainted():
     result = train("smoke", SETTINGS, run_dir=sys.argv[1])
-    evaluate(result.run_dir, episodes=2)
+    evaluate(result.run_dir, episodes=4)
 after = state()
 print([name for name in before if before[name] != after[name]])
 """

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from helpers import gliding
 from helpers.command_modules import render
 from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError
@@ -59,10 +60,11 @@ def test_the_cameras_show_the_robot_the_cube_and_where_they_are(world_env, needs
 
 @pytest.fixture(scope="module", autouse=True)
 def evaluator(smoke_run):
-    """Every picture of this file is of two goals: their program is compiled once."""
+    """Every picture of this file is of two goals, to which a robot glides: their program is
+    compiled once."""
     checkpoint = load_checkpoint(smoke_run)
     evaluator = Evaluator(checkpoint.make_env(), checkpoint.networks, ProgramCache({}), record=True)
-    with pytest.MonkeyPatch.context() as patch:
+    with gliding.everywhere(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             gallery.evaluation, "Evaluator", lambda env, networks, programs, record: evaluator
         )

@@ -110,15 +110,20 @@ def test_the_likely_module_is_suggested(places):
         make_env(load_config("smoke", ["task.name=fuond_task:Found"]))
 
 
+BESIDE = ["plan", "../my tasks/found.yaml"]
+HERE = ["plan", "smoke", "--set", "task.name=found_task:Found"]
+
+
 @pytest.mark.parametrize(
-    "words",
+    ("start", "words"),
     [
-        ["plan", "../my tasks/found.yaml"],
-        ["plan", "smoke", "--set", "task.name=found_task:Found"],
+        pytest.param(["-m"], BESIDE, id="python -m, beside"),
+        pytest.param(["-P", "-m"], HERE, id="console script, here"),
+        pytest.param(["-m"], HERE, id="python -m, here", marks=pytest.mark.slow),
+        pytest.param(["-P", "-m"], BESIDE, id="console script, beside", marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("start", [["-m"], ["-P", "-m"]], ids=["python -m", "console script"])
-def test_both_ways_to_start_a_command_find_it(places, words, start):
+def test_both_ways_to_start_a_command_find_it(places, start, words):
     # As the console script does, `-P` leaves the current folder out of the path.
     command = [sys.executable, *start, "jetbot_mjx", *words]
     done = subprocess.run(command, capture_output=True, text=True)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers import gliding
 from helpers.reports import make_episodes, polar
 from jetbot_mjx.agents.networks import make_policy
 from jetbot_mjx.evaluation import evaluate_run
@@ -23,6 +24,12 @@ from jetbot_mjx.runs.checkpoint import load_checkpoint
 from onekernel.aot.program_cache import ProgramCache
 
 GOALS = 12
+
+
+@pytest.fixture(scope="module", autouse=True)
+def glide():
+    with gliding.everywhere():
+        yield
 
 
 @pytest.fixture(scope="module")
