@@ -131,13 +131,14 @@ def batch_of(step, states):
     return made.replace(**{name: jnp.asarray(x) for name, x in states.items()})
 
 
-def by_mjx(step, states, ctrl):
+def by_mjx(step, states, ctrl, *, batched=True):
     """Return what one physics step of `mjx.step` makes of states, compiled by XLA.
 
     Args:
       step: the fused step of the model.
       states: the states of several instances.
       ctrl: their controls.
+      batched: whether all instances are stepped at once, or one after the other.
 
     Returns:
       The next states' fields, and the sensors of the states given under "sensordata", which MJX
@@ -155,7 +156,8 @@ def by_mjx(step, states, ctrl):
     # Compile in a third of the time: the test makes one step only.
     options = {"xla_backend_optimization_level": 0}
     states, ctrl = jax.device_put((states, ctrl), jax.devices("cpu")[0])
-    after = jax.jit(jax.vmap(one), compiler_options=options)(states, ctrl)
+    many = jax.vmap(one) if batched else lambda *x: jax.lax.map(lambda each: one(*each), x)
+    after = jax.jit(many, compiler_options=options)(states, ctrl)
     return jax.tree.map(np.asarray, after)
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from helpers.mjx_comparison import assert_moves_as_in_mjx
+from helpers.mjx_comparison import MjxExplodesError, assert_moves_as_in_mjx
 from helpers.random_models import random_model
 from onekernel import default_backend
 
@@ -21,4 +21,7 @@ def test_a_random_model_moves_as_in_mjx(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", sorted({*range(COUNT)} - {*QUICK}))
 def test_hundreds_of_random_models_move_as_in_mjx(seed):
-    assert_moves_as_in_mjx(*random_model(seed, INSTANCES))
+    try:
+        assert_moves_as_in_mjx(*random_model(seed, INSTANCES))
+    except MjxExplodesError as error:
+        pytest.skip(str(error))
