@@ -32,10 +32,10 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
     """
     config, encoder = checkpoint.config, policy.encoder
     rest = env.mj_model.qpos0
-    spec = json.loads(_TEMPLATE.read_text(encoding="utf-8"))
+    spec = _template()
     # Describe what belongs to an image, or leave it out.
     if encoder:
-        _describe_image(spec["image"], config.camera, env.dt)
+        spec["image"] = _image(config.camera, env.dt)
         spec["inside"] = ["pixels / 255", "convolutions", *spec["inside"]]
         spec["outside"] = ["resizing the camera's image", "stacking images", *spec["outside"]]
     else:
@@ -83,15 +83,18 @@ def _sizes(encoder: Encoder) -> JsonObject:
     }
 
 
-def _describe_image(image: JsonObject, camera: CameraConfig, period: float) -> None:
-    """Describe the image, and the camera that takes it.
+def _template() -> JsonObject:
+    return json.loads(_TEMPLATE.read_text(encoding="utf-8"))
+
+
+def _image(camera: CameraConfig, period: float) -> JsonObject:
+    """Return the description of the image, and of the camera that takes it.
 
     Args:
-      image: the entry of the spec, which is completed in place.
       camera: the camera section.
       period: the time from one image to the next [s].
     """
-    is_grey = camera.colour == "grey"
+    image, is_grey = _template()["image"], camera.colour == "grey"
     image |= {
         "height": camera.height,
         "width": camera.width,
@@ -108,6 +111,7 @@ def _describe_image(image: JsonObject, camera: CameraConfig, period: float) -> N
     }
     focal = zip(("fx", "fy", "cx", "cy"), intrinsics(camera), strict=True)
     image["camera"]["matrix"] |= {name: float(one) for name, one in focal}
+    return image
 
 
 def _observations(layout: Layout) -> list[JsonObject]:

@@ -14,9 +14,10 @@ import pytest
 
 from helpers import gliding
 from helpers.command_modules import render
+from jetbot_mjx import evaluate
 from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import evaluate_run, goal_set
+from jetbot_mjx.evaluation import goal_set
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
 from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
 from jetbot_mjx.runs.checkpoint import load_checkpoint
@@ -197,7 +198,7 @@ def test_goals_that_are_none_are_refused_from_python_too(goals):
 
 
 def test_a_report_has_as_many_goals_as_can_be_rendered():
-    assert inspect.signature(evaluate_run).parameters["episodes"].default == REPORT_GOALS
+    assert inspect.signature(evaluate).parameters["episodes"].default == REPORT_GOALS
 
 
 @pytest.mark.parametrize(
