@@ -9,9 +9,17 @@ import mujoco
 import numpy as np
 import pytest
 
+from helpers import gliding
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers import mujoco_window
 from jetbot_mjx.viewers.player import Player
+
+
+@pytest.fixture(scope="module", autouse=True)
+def glide(smoke_run):
+    """All robots of these tests glide, after the run was trained with those that do not."""
+    with gliding.everywhere():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers import gliding
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.jetbot_env import make_env
@@ -25,6 +26,13 @@ from jetbot_mjx.viewers.step_fns import AGENTS, move_goal_error
 
 SEED = 7
 HOLD = 24  # control steps of standing still after an end
+
+
+@pytest.fixture(scope="module", autouse=True)
+def glide(smoke_run):
+    """All robots of these tests glide, after the run was trained with those that do not."""
+    with gliding.everywhere():
+        yield
 
 
 @pytest.fixture(scope="module")

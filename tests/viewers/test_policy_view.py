@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from helpers import gliding
 from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks, make_policy
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.camera.wrapper import PIXELS
@@ -49,6 +50,12 @@ def test_heat_lies_over_a_grey_image(channels):
     assert red[0] == 255
     assert red[1] < 100 < yellow[1]
     np.testing.assert_array_equal(yellow, beyond)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def glide():
+    with gliding.everywhere():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from helpers import gliding
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers.player import Player
@@ -29,6 +30,13 @@ from jetbot_mjx.viewers.meshes import visible_geoms
 from jetbot_mjx.viewers.viser_panel import ControlPanel
 from jetbot_mjx.viewers.viser_scene import Scene
 from jetbot_mjx.viewers.viser_server import FIRST_PORT, ViserViewer, free_port
+
+
+@pytest.fixture(scope="module", autouse=True)
+def glide(smoke_run):
+    """All robots of these tests glide, after the run was trained with those that do not."""
+    with gliding.everywhere():
+        yield
 
 
 @pytest.fixture(scope="module")
