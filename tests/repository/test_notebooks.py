@@ -176,6 +176,7 @@ def test_evaluation_notebook_shows_the_run_of_the_training_notebook(execute, tra
     assert "scripted" in text(notebook)
 
 
+@pytest.mark.slow
 def test_the_notebook_about_kernels_compares_them_with_xla_and_c_mujoco(execute):
     notebook = execute("05_one_kernel")
     assert images(notebook) == ["image/png"]
