@@ -505,7 +505,7 @@ def measure(settings: Settings, rounds: int, xla_limit: float) -> Iterator[Row]:
       One row for each contender.
     """
     problem = Problem(settings)
-    notes = dict.fromkeys(("kernel", "mjx", "warp", "rollout", "batch"), "")
+    notes: dict[str, str] = dict.fromkeys(("kernel", "mjx", "warp", "rollout", "batch"), "")
     contenders: dict[str, Contender] = {
         "rollout": Mujoco(problem, is_batch=False),
         "batch": Mujoco(problem, is_batch=True),
