@@ -143,12 +143,13 @@ class Fused:
 
         Raises:
           UnsupportedError: there is no kernel, and `on_unsupported` is "raise".
+          TypeError: an argument is neither an array nor a number.
         """
         if _is_inside.get() or not self._is_allowed():
             return self._function(*arguments, **keywords)
         # A kernel takes flat arrays: it is found by the tree, shapes and dtypes of the arguments.
         leaves, structure = jax.tree.flatten((arguments, keywords))
-        arrays = [x if isinstance(x, jax.Array) else jnp.asarray(x) for x in leaves]
+        arrays = list(map(_as_array, leaves))
         avals = [x.aval for x in arrays]
         lowered = self._find(structure, avals)
         if isinstance(lowered.one, UnsupportedError):
@@ -240,10 +241,11 @@ class Fused:
         return lowered
 
     def _trace_and_lower(self, structure: Hashable, avals: Sequence[ShapedArray]) -> "_Lowered":
-        def flat(*words: Array) -> list[Array]:
+        def flat(*words: Array) -> PyTree:
             # Random keys are arguments as the words that they consist of.
             arguments, keywords = jax.tree.unflatten(structure, map(_with_key, avals, words))
-            return self._function(*arguments, **keywords)
+            # A result may be a number of Python, such as a reward that is always 1.
+            return jax.tree.map(_as_array, self._function(*arguments, **keywords))
 
         def without_keys(*words: Array) -> PyTree:
             results = flat(*words)
@@ -410,9 +412,15 @@ def _dtypes(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
 
 def _fallback(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
     """Return the same computation in JAX, of what is passed to the kernel."""
-    dtypes = _dtypes(_arguments(traced, places))
+    dtypes, result_dtypes = _dtypes(_arguments(traced, places)), _dtypes(traced.jaxpr.outvars)
     function = _as_function(traced, places)
-    return lambda *passed: [_to_pass(x) for x in function(*_received(passed, dtypes))]
+
+    def run(*passed: Array) -> list[Array]:
+        # A result that is a literal of the jaxpr is a number of Python here.
+        pairs = zip(function(*_received(passed, dtypes)), result_dtypes, strict=True)
+        return [_to_pass(jnp.asarray(x, dtype)) for x, dtype in pairs]
+
+    return run
 
 
 def _as_function(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
@@ -443,6 +451,23 @@ def _to_pass(x: Array) -> Array:
 def _received(passed: Sequence[Array], dtypes: Sequence[np.dtype]) -> list[Array]:
     pairs = zip(passed, dtypes, strict=True)
     return [x != 0 if dtype.kind == "b" else x for x, dtype in pairs]
+
+
+def _as_array(x: PyTree) -> Array:
+    """Return an argument or a result as an array.
+
+    Raises:
+      TypeError: it is neither an array nor a number.
+    """
+    if isinstance(x, jax.Array):
+        return x
+    try:
+        return jnp.asarray(x)
+    except TypeError:
+        raise TypeError(
+            f"a fused function takes and returns arrays and numbers, not {x!r}: fix other arguments"
+            " with functools.partial, and fuse the function of the rest"
+        ) from None
 
 
 def _is_key(x: Array | ShapedArray) -> bool:
@@ -493,4 +518,4 @@ def _shape_without_key(x: ShapedArray) -> ShapedArray:
 
 def _shape(x: PyTree) -> ShapedArray:
     """Return shape and dtype of a leaf, which may be a number of Python."""
-    return ShapedArray(x.shape, x.dtype) if hasattr(x, "shape") else jnp.asarray(x).aval
+    return ShapedArray(x.shape, x.dtype) if hasattr(x, "shape") else _as_array(x).aval

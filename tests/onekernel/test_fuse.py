@@ -104,8 +104,23 @@ def test_it_is_a_decorator_of_functions_and_methods():
     assert double.__doc__ == "Double it."
     assert [float(double(1.0)), float(triple(1.0))] == [2.0, 3.0]
     # An object that is no pytree of arrays cannot be an argument.
-    with pytest.raises(TypeError):
+    with pytest.raises(TypeError, match=r"not <.*Scale object at .*>: fix other arguments with"):
         Scale().apply(1.0)
+
+
+def test_a_word_is_no_argument():
+    with pytest.raises(TypeError, match="arrays and numbers, not 'up': fix other arguments with"):
+        fuse(lambda x, way: x if way == "up" else -x)(1.0, "up")
+    with pytest.raises(TypeError, match="arrays and numbers, not 'up'"):
+        fuse(lambda x: (x, "up"))(1.0)
+
+
+def test_results_may_be_pythons_numbers():
+    def step(x):
+        return {"next": x + 1, "reward": 1.0, "done": False, "count": 3, "gain": np.float64(2)}
+
+    ours = jax.vmap(fuse(step, on_unsupported="raise"))(states())
+    same(ours, jax.jit(jax.vmap(step))(states()))
 
 
 def test_jit_scan_and_vmap_take_it():
