@@ -40,7 +40,7 @@ MANY = ["ppo.num_envs=2048", "ppo.num_minibatches=32", "ppo.unroll_length=4"]
     ("settings", "fullest"),
     [
         ([], "learning"),
-        (MANY, "learning"),
+        pytest.param(MANY, "learning", marks=pytest.mark.slow, id="learning from many"),
         # MJX without the kernel, which compiles so long.
         pytest.param(
             [*MANY, "physics.impl=xla"], "collecting", marks=pytest.mark.slow, id="collecting"
