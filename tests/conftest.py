@@ -69,13 +69,13 @@ program_key.BUILT_IN_TASKS = frozenset()
 
 _LONGEST = (
     "test_ppo",
-    "test_pretrained",
-    "test_notebooks",
-    "test_distributed",
-    "test_resumption",
-    "test_vector",
-    "test_gymnasium",
     "test_preemption",
+    "test_resumption",
+    "test_notebooks",
+    "test_library",
+    "test_evaluate",
+    "test_distributed",
+    "test_pretrained",
     "test_eight_devices",
     "test_torture",
 )
