@@ -101,6 +101,9 @@ def drawn(robots, holds=16):
     return jnp.asarray(rng.uniform(-12, 31, (holds, robots, 2)), jnp.float32)
 
 
+# In `envs/test_cholesky.py` robots quickly make 16 steps by a kernel and by XLA, and in
+# `envs/test_physics.py` 256 by a kernel and by C MuJoCo.
+@pytest.mark.slow
 @needs_it
 def test_it_drives_as_xla_does(driven):
     env, drive_it = driven
