@@ -19,9 +19,7 @@ ROBOTS, STEPS = 24, 16
 def steps():
     """The first states of several robots, and their lowered step with each choice."""
     choices = ("unrolled", "library")
-    envs = [
-        make_env(parse_config({"physics": {"cholesky": x, "impl": "xla"}})) for x in choices
-    ]
+    envs = [make_env(parse_config({"physics": {"cholesky": x, "impl": "xla"}})) for x in choices]
     keys = jax.random.split(jax.random.PRNGKey(0), ROBOTS)
     states = jax.jit(jax.vmap(envs[0].reset))(keys).pipeline_state
     ctrl = np.zeros((ROBOTS, 2), np.float32)

@@ -11,7 +11,8 @@ SLIDER = """
 <mujoco>
   <worldbody>
     <body>
-      <joint name="slider" type="slide" range="-0.5 0.5" limited="true"/><geom size="0.1"/>
+      <joint name="slider" type="slide" axis="1 0 0" range="-0.5 0.5" limited="true"/>
+      <geom size="0.1"/>
     </body>
   </worldbody>
   <actuator><motor joint="slider"/></actuator>
