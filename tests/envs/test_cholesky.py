@@ -6,26 +6,25 @@ import jax.scipy.linalg
 import numpy as np
 import pytest
 
+from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.jetbot_env import make_env
 
 CALLS = "potrf", "trsm", "stablehlo.cholesky", "stablehlo.triangular_solve"
-
-
-def made(choice):
-    return make_env(parse_config({"physics": {"cholesky": choice, "impl": "xla"}}))
+ROBOTS, STEPS = 24, 16
 
 
 @pytest.fixture(scope="module")
 def steps():
-    """A first state, and its lowered step with each choice."""
-    envs = {choice: made(choice) for choice in ("unrolled", "library")}
-    state = jax.jit(envs["library"].reset)(jax.random.PRNGKey(0)).pipeline_state
-    lowered = {
-        choice: jax.jit(env.physics.step).lower(state, jnp.zeros(2)) for choice, env in envs.items()
-    }
-    return state, lowered
+    """The first states of several robots, and their lowered step with each choice."""
+    choices = ("unrolled", "library")
+    envs = [make_env(parse_config({"physics": {"cholesky": x, "impl": "xla"}})) for x in choices]
+    keys = jax.random.split(jax.random.PRNGKey(0), ROBOTS)
+    states = jax.jit(jax.vmap(envs[0].reset))(keys).pipeline_state
+    ctrl = np.zeros((ROBOTS, 2), np.float32)
+    lowered = [jax.jit(jax.vmap(env.physics.step)).lower(states, ctrl) for env in envs]
+    return states, dict(zip(choices, lowered, strict=True))
 
 
 @pytest.mark.parametrize(("choice", "calls"), [("unrolled", False), ("library", True)])
@@ -34,15 +33,21 @@ def test_the_choice_decides_whether_physics_calls_a_library(steps, choice, calls
     assert any(call in text for call in CALLS) == calls
 
 
-def test_both_choices_make_the_same_step(steps):
+def test_both_choices_and_a_kernel_make_the_same_steps(steps, world_env):
     first, lowered = steps
-    states = []
-    for choice in ("unrolled", "library"):
-        step = lowered[choice].compile()
-        states.append(first)
-        for _ in range(5):
-            states[-1] = step(states[-1], jnp.array([4.0, 9.0]))
-    np.testing.assert_allclose(states[0].qvel, states[1].qvel, atol=2e-5)
+    targets = np.random.default_rng(0).uniform(-12, 31, (STEPS, ROBOTS, 2)).astype(np.float32)
+    ends = []
+    for step in (
+        *(one.compile() for one in lowered.values()),
+        jax.jit(jax.vmap(world_env.physics.step)),
+    ):
+        states = first
+        for target in targets:
+            states = step(states, target)
+        ends.append(states)
+    for other in ends[1:]:
+        np.testing.assert_allclose(other.qvel, ends[0].qvel, atol=2e-5)
+    assert np.ptp(np.asarray(ends[0].qvel[:, 0])) > 0.05
 
 
 def test_nothing_of_jax_is_replaced_while_physics_is_traced(monkeypatch):
@@ -54,7 +59,6 @@ def test_nothing_of_jax_is_replaced_while_physics_is_traced(monkeypatch):
         return step(*arguments)
 
     monkeypatch.setattr(mjx, "step", looking_round)
-    env = made("unrolled")
-    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
-    jax.eval_shape(env.physics.step, state, jnp.zeros(2))
+    physics, state = small_physics(cholesky="unrolled", impl="xla")
+    jax.eval_shape(physics.step, state, jnp.zeros(1))
     assert set(seen) == {library}

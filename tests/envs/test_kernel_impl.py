@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.kernel_impl import KernelImpl
@@ -46,14 +47,14 @@ def test_an_operation_that_no_kernel_can_do_is_an_error_only_if_one_was_asked_fo
 
 @pytest.mark.skipif(cpu.obstacle() is not None, reason="there is no such kernel here")
 def test_physics_as_one_kernel_raises_errors_of_the_user():
-    env = make_env(parse_config({"physics": {"impl": "llvm"}}))
-    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+    physics, state = small_physics(impl="llvm")
     with pytest.raises(UserError, match=r"^physics as one kernel cannot be .*physics\.impl = xla"):
-        jax.grad(lambda ctrl: env.physics.step(state, ctrl).qvel[0])(jnp.ones(2))
+        jax.grad(lambda ctrl: physics.step(state, ctrl).qvel[0])(jnp.ones(1))
     with pytest.raises(UserError, match=r"^physics\.impl = llvm: this program is for cuda: choose"):
-        jax.jit(env.physics.step).trace(state, jnp.ones(2)).lower(lowering_platforms=("cuda",))
+        jax.jit(physics.step).trace(state, jnp.ones(1)).lower(lowering_platforms=("cuda",))
     # So do those of a whole step, in which physics is a part.
-    first = env.reset(jax.random.PRNGKey(0))
+    env = make_env(parse_config({"physics": {"impl": "llvm"}}))
+    first = jax.jit(env.reset)(jax.random.PRNGKey(0))
     with pytest.raises(UserError, match=r"^physics as one kernel cannot be .*physics\.impl = xla"):
         jax.grad(lambda action: env.step(first, action).reward)(jnp.ones(2))
 
@@ -76,11 +77,11 @@ def test_the_remedy_helps():
 
 
 def test_a_step_casts_what_it_is_given():
-    env = make_env(parse_config({}))
-    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    plain = env.physics.step(state, jnp.float32([4, 8]))
+    physics, state = small_physics()
+    plain = physics.step(state, jnp.float32([4]))
+    assert plain.qpos > 0
     for dtype in (jnp.bfloat16, jnp.float16, jnp.int32):
-        cast = env.physics.step(state, jnp.array([4, 8], dtype))
+        cast = physics.step(state, jnp.array([4], dtype))
         np.testing.assert_array_equal(cast.qpos, plain.qpos)
 
 
@@ -106,13 +107,13 @@ def test_a_run_with_a_kernel_of_one_device_can_be_used_on_any():
 
 @pytest.mark.parametrize("impl", ["auto", "llvm"])
 def test_a_step_that_no_kernel_can_do_is_xlas_unless_the_kernel_was_asked_for(impl, monkeypatch):
-    # The robot's matrix has 8 rows.
-    monkeypatch.setattr(linear_algebra, "MAX_ROWS", 7)
+    # The slider's matrix has one row.
+    monkeypatch.setattr(linear_algebra, "MAX_ROWS", 0)
     if impl == "llvm" and cpu.obstacle() is not None:
         pytest.skip("there is no such kernel here")
-    env = make_env(parse_config({"physics": {"impl": impl}}))
+    physics, state = small_physics(impl=impl)
     if impl == "auto":
-        assert env.physics.impl == "xla"
+        assert physics.impl == "xla"
         return
     with pytest.raises(UserError, match=r"physics\.impl = llvm: one kernel cannot do.*cholesky"):
-        env.physics.step(env.reset(jax.random.PRNGKey(0)).pipeline_state, jnp.zeros(2))
+        physics.step(state, jnp.zeros(1))

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from helpers import motion
+from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.jetbot_env import make_env
@@ -257,13 +258,12 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
 def test_another_solver_is_another_kernel():
     # The number of iterations is not among the arrays of MJX's model, so that a key made of the
     # arrays alone would be the same.
-    env = make_env(parse_config({}))
-    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    option = env.mjx_model.opt
+    physics, state = small_physics()
+    option = physics.model.opt
 
     def kernels(**changed):
-        here = env.with_model(env.mjx_model.replace(opt=option.replace(**changed)))
-        lowered = jax.jit(here.physics.step).trace(state, jnp.zeros(2)).lower()
+        here = physics.with_model(physics.model.replace(opt=option.replace(**changed)))
+        lowered = jax.jit(here.step).trace(state, jnp.zeros(1)).lower()
         # On a CPU it names machine code by a hash, on a GPU it holds the PTX.
         calls = re.findall(r"custom_call @\S*(?:onekernel_|xla\.gpu\.ptx).*", lowered.as_text())
         (call,) = calls

@@ -655,6 +655,7 @@ ENVS, EPISODE_LENGTH, DRIVEN = 19, 7, 60
 NEAR_GOALS = ["goal_distance_min=0.1", "goal_distance_span=0.1", "success_radius=0.12"]
 
 
+@functools.cache
 def environment(name, root):
     """Robots whose steps are one kernel, and a robot of which only physics is one."""
     overrides = [f"task.{override}" for override in NEAR_GOALS]

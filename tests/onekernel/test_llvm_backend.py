@@ -14,6 +14,8 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import Mesh, PartitionSpec
 
+from helpers import gliding
+from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import program_key
 from jetbot_mjx.envs.jetbot_env import make_env
@@ -101,6 +103,9 @@ def drawn(robots, holds=16):
     return jnp.asarray(rng.uniform(-12, 31, (holds, robots, 2)), jnp.float32)
 
 
+# In `envs/test_cholesky.py` robots quickly make 16 steps by a kernel and by XLA, and in
+# `envs/test_physics.py` 256 by a kernel and by C MuJoCo.
+@pytest.mark.slow
 @needs_it
 def test_it_drives_as_xla_does(driven):
     env, drive_it = driven
@@ -188,19 +193,18 @@ def test_few_instances_have_few_lanes():
 
 @needs_it
 def test_models_that_differ_from_robot_to_robot_go_into_the_kernel():
-    env = make_env(parse_config({}))
+    physics, state = small_physics()
     gains = jnp.float32([0.5, 1.0])
-    state = jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state
 
     def one(gain):
-        gainprm = env.mjx_model.actuator_gainprm * gain
-        here = env.with_model(env.mjx_model.replace(actuator_gainprm=gainprm))
-        assert here.physics.impl == "llvm"
-        return here.physics.step(state, jnp.ones(2)).qvel
+        gainprm = physics.model.actuator_gainprm * gain
+        here = physics.with_model(physics.model.replace(actuator_gainprm=gainprm))
+        assert here.impl == "llvm"
+        return here.step(state, jnp.ones(1)).qvel
 
     ours = jax.vmap(one)(gains)
-    np.testing.assert_allclose(ours[1], env.physics.step(state, jnp.ones(2)).qvel, atol=1e-5)
-    assert ours[0, 6] < 0.9 * ours[1, 6]
+    np.testing.assert_allclose(ours[1], physics.step(state, jnp.ones(1)).qvel, atol=1e-5)
+    assert 0 < ours[0, 0] < 0.9 * ours[1, 0]
 
 
 @needs_it
@@ -377,9 +381,12 @@ def test_where_it_cannot_be_had_xla_makes_the_step_and_one_line_says_so(
 ):
     where(monkeypatch)
     env = make_env(parse_config({}))
-    for _ in range(2):
+    physics, state = small_physics()
+    with gliding.everywhere():
         jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(2)), jax.random.PRNGKey(0))
-    assert env.physics.impl == "xla"
+    for _ in range(2):
+        jax.eval_shape(physics.step, state, jnp.zeros(1))
+    assert env.physics.impl == physics.impl == "xla"
     line = f"slow: physics.impl: training is 5 to 11 times slower: {cpu.obstacle()}\n"
     assert capsys.readouterr().err == line
     with pytest.raises(UserError, match=r"physics\.impl = llvm: .+; or choose xla or auto"):

@@ -643,12 +643,19 @@ def env():
     return make_env(parse_config({"robot": {"preset": "real"}}))
 
 
-def test_the_arithmetic_of_mjx_is_mjxs_own(env):
+@pytest.fixture(scope="module")
+def substep(env):
+    """A physics step of MJX, the state before the first one, and the step lowered to scalars."""
+
     def step(physics, ctrl):
         return env.physics.substep(physics, (ctrl, []))
 
     first = jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state
-    program = jaxpr.scalarize(step, first, jnp.zeros(2))
+    return step, first, jaxpr.scalarize(step, first, jnp.zeros(2))
+
+
+def test_the_arithmetic_of_mjx_is_mjxs_own(substep):
+    step, first, program = substep
     rng = np.random.default_rng(0)
     robots = 16
     states = jax.tree.map(lambda x: jnp.repeat(x[None], robots, 0), first)
@@ -667,15 +674,11 @@ def test_the_arithmetic_of_mjx_is_mjxs_own(env):
     assert np.ptp(np.asarray(states.qvel[:, 0])) > 0.05
 
 
-def test_of_the_arithmetic_of_mjx_most_is_multiplication_by_zero(env):
+def test_of_the_arithmetic_of_mjx_most_is_multiplication_by_zero(env, substep):
     data = mjx.make_data(env.mj_model)
     size = sum(leaf.size for leaf in jax.tree.leaves(data))
-    step = jaxpr.scalarize(
-        lambda physics: env.physics.substep(physics, (jnp.zeros(2), [])),
-        env.reset(jax.random.PRNGKey(0)).pipeline_state,
-    )
     # The traced step has some 15,000 operations on arrays of up to 64 numbers.
-    assert size < step.size < 15_000
+    assert size < substep[2].size < 15_000
 
 
 def test_the_primitives_with_a_rule_are_listed_once():

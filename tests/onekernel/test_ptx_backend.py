@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.kernel_cases import FUNCTIONS, SCANS, VECTOR, robots
+from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from onekernel import gpu
@@ -61,7 +62,7 @@ def test_blocks_grow_with_the_number_of_robots(robots, threads):
 
 @pytest.mark.skipif(gpu.obstacle() is None, reason="there is an NVIDIA GPU")
 def test_without_a_gpu_there_is_none():
-    assert make_env(parse_config({})).physics.impl != "ptx"
+    assert small_physics()[0].impl != "ptx"
 
 
 @on_a_gpu
