@@ -14,6 +14,7 @@ loops and branches:
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -39,6 +40,10 @@ MAX_UNROLLED_TRIPS = 64
 
 MAX_UNROLLED_OPERATIONS = 512
 """Largest number of operations of a loop that is unrolled although it could stay a loop."""
+
+MAX_UNROLLED_SCAN_OPERATIONS = 16_384
+"""Largest number of operations of an unrolled scan with sequences that could be a loop: as a loop,
+it keeps them in memory. LLVM takes 2 s to compile that many for a CPU."""
 
 MAX_ARRAY_BYTES = 64 * 1024
 """Most memory for the arrays of one instance: the lanes of a CPU have up to 1 MiB together on the
@@ -121,7 +126,10 @@ class ControlFlow:
             rolled = self._counted_loop(scan)
             if rolled is not None:
                 return rolled
-        elif scan.length > MAX_UNROLLED_TRIPS:
+        else:
+            if scan.length <= MAX_UNROLLED_TRIPS:
+                with contextlib.suppress(UnsupportedError):
+                    return self._unrolled_scan(scan, MAX_UNROLLED_SCAN_OPERATIONS)
             try:
                 return self._rolled_scan(scan)
             except UnsupportedError as error:
@@ -132,13 +140,19 @@ class ControlFlow:
         except UnsupportedError as error:
             raise obstacle or error from None
 
-    def _unrolled_scan(self, scan: "_Scan") -> list[ScalarArray]:
-        """Lower the body of a scan once for each iteration, with its rows of the sequences."""
-        order, carry = range(scan.length), scan.carry
+    def _unrolled_scan(self, scan: "_Scan", limit: float = math.inf) -> list[ScalarArray]:
+        """Lower the body of a scan once for each iteration, with its rows of the sequences.
+
+        Raises:
+          UnsupportedError: an operation cannot be lowered, or there are more than `limit`.
+        """
+        order, carry, count_before = range(scan.length), scan.carry, self._graph.count
         rows: dict[int, list[ScalarArray]] = {}
         for i in reversed(order) if scan.reverse else order:
             results = self._lower(scan.body, [*scan.constants, *carry, *scan.row(i)])
             carry, rows[i] = results[: len(carry)], results[len(carry) :]
+            if self._graph.count - count_before > limit:
+                raise UnsupportedError("a scan that is not short")
         stacked = scan.body.jaxpr.outvars[len(carry) :]
         return [*carry, *_columns([rows[i] for i in order], [shape_of(x) for x in stacked])]
 
@@ -261,10 +275,15 @@ class ControlFlow:
             return [where(self._graph, rows, *pair) for pair in pairs] if rows.ndim else updated
 
         state = list(operands[second:])
-        with contextlib.suppress(UnsupportedError):
+        try:
             return self._unroll_or_loop(state, condition, next_state)
-        # For example, an index depends on the loop counter, which is constant once unrolled.
-        return self._unroll(state, condition, next_state)
+        except UnsupportedError as error:
+            # For example, an index depends on the loop counter, which is constant once unrolled.
+            obstacle = error
+        try:
+            return self._unroll(state, condition, next_state)
+        except UnsupportedError:
+            raise obstacle from None
 
     def _unroll_or_loop(
         self,

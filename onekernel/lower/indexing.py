@@ -144,12 +144,13 @@ RULES: dict[str, Rule] = {
     "broadcast_in_dim": _broadcast_in_dim,
     "concatenate": lambda equation, *xs: np.concatenate(xs, equation.params["dimension"]),
     "copy": lambda equation, x: x,
+    # The scalars of an instance are where it is computed.
+    "device_put": lambda equation, *xs: list(xs),
     "empty": _empty,
     "expand_dims": _reshape,
     "iota": _iota,
     "optimization_barrier": lambda equation, *xs: list(xs),
     "pad": _pad,
-    # Arrays are on devices; the scalars of one instance are where it is computed.
     "pvary": lambda equation, *xs: list(xs),
     "reshape": _reshape,
     "reshard": lambda equation, x: x,

@@ -23,7 +23,9 @@ functions are lowered whose numbers may not be.) The lowering knows nothing of i
 import dataclasses
 import functools
 import inspect
+import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -67,6 +69,11 @@ _GRAPH_RULES = {**ARITHMETIC_RULES, **RANDOM_RULES, **DYNAMIC_RULES}
 """Lowering rules that take the graph before the equation and its operands."""
 
 _FLOAT = np.dtype(np.float32)
+
+_PACKAGE = str(Path(__file__).parents[1]) + os.sep
+
+_MAX_FRAMES = 100
+"""Number of frames among which the user's line is looked for, from the innermost."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -256,7 +263,7 @@ class _JaxprLowering:
             return self._apply_rule(equation, operands)
         except UnsupportedError as error:
             # The innermost equation is the one that the user wrote.
-            error.place = error.place or source_info_util.summarize(equation.source_info)
+            error.place = error.place or _place(equation)
             raise
 
     def _apply_rule(self, equation: JaxprEqn, operands: list[ScalarArray]) -> list[ScalarArray]:
@@ -359,6 +366,12 @@ class _JaxprLowering:
         return self.lower(jax.make_jaxpr(function)(*(x.aval for x in equation.invars)), operands)
 
     _cholesky = _lu = _qr = _triangular_solve = _linear_algebra
+
+
+def _place(equation: JaxprEqn) -> str | None:
+    """Return the innermost line outside of this package that made an equation, if one is known."""
+    lines = source_info_util.summarize(equation.source_info, num_frames=_MAX_FRAMES).split("\n")
+    return next((line for line in reversed(lines) if line and not line.startswith(_PACKAGE)), None)
 
 
 def _constants(array: ArrayLike) -> ScalarArray:

@@ -214,6 +214,13 @@ def test_what_no_kernel_can_do_is_told_once_with_its_line():
     same(results[1], spectrum(x))
 
 
+def test_no_line_of_the_package_is_told_where_a_library_function_is_fused():
+    # JAX records the innermost frames only, so the user's line may be unknown.
+    with pytest.raises(UnsupportedError, match=r"^the operation eigh") as raised:
+        fuse(jnp.linalg.eigh, on_unsupported="raise")(jnp.eye(3))
+    assert "fused.py" not in str(raised.value)
+
+
 def test_it_can_be_silent_an_error_or_the_callers_business():
     x = np.ones(4, np.float32)
     with warnings.catch_warnings():

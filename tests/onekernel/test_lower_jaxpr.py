@@ -566,6 +566,25 @@ def test_a_scan_with_rows_stays_a_loop_if_it_is_long(length, loops, reverse):
         assert program.array_bytes == 2 * 4 * length
 
 
+def test_a_short_scan_stays_a_loop_if_it_is_large(monkeypatch):
+    monkeypatch.setattr(control_flow, "MAX_UNROLLED_SCAN_OPERATIONS", 40)
+    assert not list(items(check(sums(10), robots=3).block, PlacedLoop))
+    assert len(list(items(check(sums(40), robots=3).block, PlacedLoop))) == 1
+
+
+def test_of_a_loop_that_writes_among_too_many_places_these_are_told():
+    def function(x):
+        trips = x[0].astype(int)
+        return jax.lax.fori_loop(0, trips, lambda i, table: table.at[i].set(x[1]), jnp.zeros(300))
+
+    with pytest.raises(UnsupportedError, match=r"with 300 places \("):
+        jaxpr.scalarize(function, VECTOR)
+
+
+def test_where_an_array_is_put_changes_nothing():
+    assert check(lambda x: jax.device_put(x * 2), robots=3).size == 4
+
+
 def test_what_every_step_is_given_alike_or_knows_takes_no_memory():
     def function(x):
         def step(c, row):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
@@ -46,6 +47,8 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs import metrics
 from jetbot_mjx.runs.sb3_tags import aliases
+from onekernel import fuse, gpu
+from onekernel.gpu.kernel_text import kernel_text
 
 
 def nav():
@@ -591,6 +594,29 @@ def test_the_kernels_page_shows_what_its_first_block_prints(capsys):
     exec(compile(next(blocks(page, "python")), "kernels.md", "exec"), {})
     (shown,) = blocks(page, "llvm")
     assert capsys.readouterr().out.strip() == shown.strip()
+
+
+def test_the_picture_of_fuse_shows_what_is_written():
+    code = re.findall(
+        r'<text class="code".*?>(.*)</text>', (ROOT / "docs/fuse.svg").read_text("utf-8")
+    )
+    source, shown = "\n".join(code[:2]), " ".join(code[2:])
+    namespace = {}
+    exec(source, namespace)
+    lowered = fuse(namespace["step"]).lowered(jax.ShapeDtypeStruct((2,), np.float32))
+    kernel = lowered.one
+    jaxpr = [x.primitive.name for x in lowered.traced.jaxpr.eqns]
+    assert re.findall(r"\b[b-d] = (\w+)", shown) == jaxpr
+    scalars = sorted((x.index, x.op) for x in kernel.program.block.values())
+    assert sorted((int(i), op) for i, op in re.findall(r"s(\d) = (\w+)", shown)) == scalars
+    written = kernel_text(kernel)
+    ptx = " ".join(gpu.assembled(written, 90).split())
+    instructions = [x for x in code if x.startswith("%")]
+    assert len(instructions) == 2
+    assert all(x in written for x in instructions)
+    instructions = [x for x in code if x.endswith(";")]
+    assert len(instructions) == 3
+    assert all(x in ptx for x in instructions)
 
 
 def test_the_change_of_the_loss_on_the_kernels_page_fits_the_code():

@@ -59,6 +59,8 @@ def kernel(root, tmp_path_factory):
         patch.setenv("JETBOT_EPISODES", "1")
         patch.setenv("JETBOT_OWN_DIR", str(folder / "own"))
         patch.setenv("ONEKERNEL_INSTANCES", "32")
+        # XLA compiles the hopper for a quarter of a minute, a pendulum for a second.
+        patch.setenv("ONEKERNEL_MODEL", "pendulum")
         patch.setenv("JETBOT_OVERRIDES", " ".join(SHORT))
         # Nothing of the user's own Jupyter, and nothing left in it.
         patch.setenv("JUPYTER_PATH", str(folder / "jupyter"))
@@ -182,11 +184,15 @@ def test_the_notebook_about_kernels_compares_them_with_xla_and_c_mujoco(execute)
     assert images(notebook) == ["image/png"]
     printed = text(notebook)
     assert printed.count("one kernel   compiled in") == 3
-    assert printed.count("XLA          compiled in") == 2
+    assert printed.count("XLA          compiled in") == 3
+    assert printed.count("M instances a second") == 6
     assert "balance is one kernel" in printed
     # Of a chaotic system, round-off grows; it is small after the time that is integrated here.
-    (apart, velocity) = re.findall(r"largest difference (?:of a velocity )?(\S+?),?\s", printed)
+    apart, position, velocity = re.findall(
+        r"largest difference (?:of a (?:position|velocity) )?(\S+?),?\s", printed
+    )
     assert float(apart) < 0.1
+    assert float(position) < 1e-6
     assert float(velocity) < 1e-5
 
 
