@@ -8,7 +8,8 @@ from onekernel import default_backend
 
 pytestmark = pytest.mark.skipif(default_backend() is None, reason="no back end for kernels")
 
-QUICK = (5,)
+QUICK = (101,)
+"""Of the smaller ones, one with actuators, sensors and limits."""
 COUNT = 210
 INSTANCES = 16
 
