@@ -27,8 +27,10 @@ if os.environ["JAX_PLATFORMS"] == "cpu":
     # all are compiled alike, so that two stay comparable. One that runs for long is `optimized`.
     # Without the emitters, no call of a training step gave other bits than the one before, in 647.
     _flags = ["--xla_backend_optimization_level=0"]
-    if version("jaxlib").startswith("0.10."):  # others do not know this flag, and abort
+    if version("jaxlib").startswith("0.10."):  # others may not know a flag, and abort
         _flags.append("--xla_cpu_use_fusion_emitters=false")
+        # One module of LLVM's for each program: 32 are copied, and take a quarter longer.
+        _flags.append("--xla_cpu_parallel_codegen_split_count=1")
     os.environ.setdefault("XLA_FLAGS", " ".join(_flags))
 os.environ.setdefault("MPLBACKEND", "agg")
 # The cores are the workers': threads of NumPy's products would wait for one, and burn another.
