@@ -39,7 +39,7 @@ CASES = [
     # is not full.
     ("swish", Minibatch(40, 37, 9), 2, 90),
     ("relu", Minibatch(20, 13, 10), 1, 86),
-    ("elu", Minibatch(90, 90, 5), 3, 80),
+    pytest.param("elu", Minibatch(90, 90, 5), 3, 80, marks=pytest.mark.slow),
     # Several blocks of one policy.
     ("tanh", Minibatch(20, 19, 16), 1, 80),
 ]

@@ -75,8 +75,8 @@ CASES = {
 }
 
 
-# The steps of both are among those of the quick cases, and so are several parts and policies.
-FURTHER = "jetbot", "egocentric", "more than a part"
+# Their steps are among those of the quick cases, and so are several parts and policies.
+FURTHER = "jetbot", "egocentric", "smoke", "more than a part"
 
 
 @pytest.mark.parametrize("case", slow_unless(lambda case: case not in FURTHER, CASES))

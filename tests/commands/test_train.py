@@ -142,6 +142,8 @@ def test_training_stops_at_the_success_asked_for(root, tmp_path, capsys):
     assert result.standings[0].last.success_rate >= 0.01
 
 
+# The trainer `brax`, above, takes it as that too.
+@pytest.mark.slow
 def test_stock_brax_takes_wrap_for_training_as_its_wrap_env_fn(root):
     config = load_config(root / "configs" / "smoke.yaml")
     with brax_trainer.device_put_replicated():

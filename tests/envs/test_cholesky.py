@@ -15,33 +15,24 @@ CALLS = "potrf", "trsm", "stablehlo.cholesky", "stablehlo.triangular_solve"
 ROBOTS, STEPS = 24, 16
 
 
-@pytest.fixture(scope="module")
-def steps():
-    """The first states of several robots, and their lowered step with each choice."""
-    choices = ("unrolled", "library")
-    envs = [make_env(parse_config({"physics": {"cholesky": x, "impl": "xla"}})) for x in choices]
-    keys = jax.random.split(jax.random.PRNGKey(0), ROBOTS)
-    states = jax.jit(jax.vmap(envs[0].reset))(keys).pipeline_state
-    ctrl = np.zeros((ROBOTS, 2), np.float32)
-    lowered = [jax.jit(jax.vmap(env.physics.step)).lower(states, ctrl) for env in envs]
-    return states, dict(zip(choices, lowered, strict=True))
-
-
 @pytest.mark.parametrize(("choice", "calls"), [("unrolled", False), ("library", True)])
-def test_the_choice_decides_whether_physics_calls_a_library(steps, choice, calls):
-    text = steps[1][choice].as_text()
+def test_the_choice_decides_whether_physics_calls_a_library(choice, calls):
+    physics, state = small_physics(cholesky=choice, impl="xla")
+    text = jax.jit(physics.step).lower(state, jnp.zeros(1)).as_text()
     assert any(call in text for call in CALLS) == calls
 
 
-def test_both_choices_and_a_kernel_make_the_same_steps(steps, world_env):
-    first, lowered = steps
+# The quick tests compare both on a chain of hinges, in `onekernel/test_linear_algebra.py`.
+@pytest.mark.slow
+def test_both_choices_and_a_kernel_make_the_same_steps(world_env):
+    settings = [{"cholesky": choice, "impl": "xla"} for choice in ("unrolled", "library")]
+    envs = [*(make_env(parse_config({"physics": one})) for one in settings), world_env]
+    keys = jax.random.split(jax.random.PRNGKey(0), ROBOTS)
+    first = jax.jit(jax.vmap(world_env.reset))(keys).pipeline_state
     targets = np.random.default_rng(0).uniform(-12, 31, (STEPS, ROBOTS, 2)).astype(np.float32)
     ends = []
-    for step in (
-        *(one.compile() for one in lowered.values()),
-        jax.jit(jax.vmap(world_env.physics.step)),
-    ):
-        states = first
+    for env in envs:
+        step, states = jax.jit(jax.vmap(env.physics.step)), first
         for target in targets:
             states = step(states, target)
         ends.append(states)

@@ -687,7 +687,8 @@ def drive_all(state, step, spoil):
 
 
 @pytest.fixture(
-    scope="module", params=["smoke", pytest.param("jetbot", marks=pytest.mark.slow), "real_jetbot"]
+    scope="module",
+    params=slow_unless(lambda name: name == "real_jetbot", ["smoke", "jetbot", "real_jetbot"]),
 )
 def driven(request, root):
     """What became of robots whose steps are one kernel, and many."""

@@ -15,7 +15,7 @@ from onekernel.lower import control_flow
 if cpu.obstacle():
     pytest.skip("llvmlite compiles nothing here", allow_module_level=True)
 
-QUICK = 16
+QUICK = 11
 BATCH = 24  # functions in one test of the slow suite
 BATCHES = 100
 REGRESSIONS = (33, 62, 110, 236, 689, 972)

@@ -207,6 +207,8 @@ def test_models_that_differ_from_robot_to_robot_go_into_the_kernel():
     assert 0 < ours[0, 0] < 0.9 * ours[1, 0]
 
 
+# The quick tests train on eight devices, in `training/test_eight_devices.py`.
+@pytest.mark.slow
 @needs_it
 def test_on_eight_devices_at_once_each_steps_its_own():
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={DEVICES}"

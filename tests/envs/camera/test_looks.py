@@ -371,8 +371,8 @@ def test_objects_stand_around_and_look_like_no_goal(eye, plain):
 @pytest.mark.parametrize(
     "camera",
     [
-        {},
         {"colour": "grey", "lens": "fisheye"},
+        pytest.param({}, marks=pytest.mark.slow),
         pytest.param({"colour": "grey"}, marks=pytest.mark.slow),
         pytest.param({"lens": "fisheye"}, marks=pytest.mark.slow),
     ],
