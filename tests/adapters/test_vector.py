@@ -36,7 +36,7 @@ def gliding():
 NEAR = {"episode_length": 128, "success_radius": 0.4}
 
 TASKS = [
-    pytest.param({"task": NEAR}, id="world"),
+    pytest.param({"task": NEAR}, id="world", marks=pytest.mark.slow),
     # The observation of most of the examples.
     pytest.param(
         {"task": {**NEAR, "observation": "egocentric"}}, id="egocentric", marks=pytest.mark.slow
