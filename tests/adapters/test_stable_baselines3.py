@@ -103,8 +103,9 @@ def test_a_step_before_the_first_reset_is_refused():
 
 
 @pytest.mark.parametrize("task", ["gates", pytest.param("pillars", marks=pytest.mark.slow)])
+@everywhere()
 def test_a_batch_is_that_of_gymnasium(task, root, monkeypatch):
-    """Also where a goal advances, and where solid bodies stand."""
+    """Also where a goal advances, and of a model with more bodies; both glide alike."""
     monkeypatch.syspath_prepend(str(root / "examples"))
     config = root / "examples" / f"{task}.yaml"
     ours, theirs = (make(4, max_episode_length=40, config=config) for make in BATCHES)
