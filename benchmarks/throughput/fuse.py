@@ -121,7 +121,7 @@ class Row(NamedTuple):
     """Median of the rounds; None: it did not compile within the limit."""
     cpu_seconds: float | None
     """Processor time of all threads for one environment step of one instance, the median of the
-    rounds [s]; other programs on the machine change it little."""
+    rounds [s]; other programs on the machine change it little. None: a GPU makes the steps."""
     compile_seconds: float | None
     """Time of tracing, lowering and compiling [s]; C MuJoCo has none."""
     repeats: list[float]
@@ -144,7 +144,10 @@ class Problem:
             self.model.opt.integrator = INTEGRATORS[settings.integrator]
         for option, value in settings.solver:
             setattr(self.model.opt, option, value)
-        model, rng = self.model, np.random.default_rng(0)
+        model = self.model
+        # Two generators: states and controls of the first instances do not depend on how many there
+        # are, nor on each other.
+        rng, rng_of_states = np.random.default_rng(0), np.random.default_rng(1)
         shape = settings.num_envs, settings.unroll, model.nu
         low, high = model.actuator_ctrlrange.T
         limited = model.actuator_ctrllimited.astype(bool)
@@ -158,9 +161,9 @@ class Problem:
         self.warmstarts = np.zeros((len(states), model.nv), np.float32)
         for i in range(len(states)):
             mujoco.mj_resetData(model, data)
-            data.qvel[:] = rng.normal(0.0, 0.1, model.nv)
+            data.qvel[:] = rng_of_states.normal(0.0, 0.1, model.nv)
             data.ctrl[:] = self.controls[i, -1]
-            for _ in range(rng.integers(1, _MOST_STEPS)):
+            for _ in range(rng_of_states.integers(1, _MOST_STEPS)):
                 mujoco.mj_step(model, data)
             # All contenders begin from numbers that float32 has.
             self.warmstarts[i] = data.qacc_warmstart
@@ -271,8 +274,13 @@ def _by_xla(problem: Problem) -> Compiled:
 
 def _by_warp(problem: Problem) -> Compiled:
     """Return `mjx.step` with the kernels of MuJoCo Warp."""
+    # Its messages about loaded kernels are disabled, and those of each instance whose solver used
+    # all iterations.
+    warp = importlib.import_module("warp")
+    warp.config.log_level = warp.LOG_WARNING
     first = problem.first(fuse_mjx(problem.model))
     model = mjx.put_model(problem.model, impl="warp")
+    model = model.tree_replace({"opt._impl.warn_overflow": 0})
     # As many contacts and constraints as MJX makes of this model.
     rows = mjx.make_data(problem.model, impl="jax")._impl
     contacts, constraints = rows.contact.dist.shape[0], rows.efc_J.shape[0]
@@ -553,13 +561,14 @@ def _row(
 ) -> Row:
     """Return the row of a contender; None: it cannot make a step here."""
     rates = [x.env_steps_per_second for x in timed]
+    is_on_cpu = name in ("rollout", "batch") or jax.default_backend() == "cpu"
     return Row(
         problem.settings.name,
         problem.model.nv,
         name,
         problem.settings.num_envs if contender is None else contender.num_envs,
         statistics.median(rates) if rates else None,
-        statistics.median(x.cpu_seconds for x in timed) if timed else None,
+        statistics.median(x.cpu_seconds for x in timed) if timed and is_on_cpu else None,
         None if contender is None else contender.compile_seconds,
         rates,
         *differences,

@@ -482,6 +482,12 @@ def test_a_model_is_stepped_alike_by_all_contenders(tmp_path, monkeypatch):
         assert 0 < busy < 1.5 * os.cpu_count()
 
 
+def test_the_first_instances_do_not_depend_on_how_many_there_are():
+    few, many = (fuse.Problem(fuse.Settings("hopper", "own", (), n, 1, 3)) for n in (2, 5))
+    np.testing.assert_array_equal(few.controls, many.controls[:2])
+    np.testing.assert_array_equal(few.states, many.states[:2])
+
+
 def test_mujocos_batch_and_rollout_start_from_the_same_states():
     settings = fuse.Settings("chain:2", "own", (), 4, 1, 3)
     problem = fuse.Problem(settings)
