@@ -46,8 +46,8 @@ def check(kernel: Kernel, arguments: Sequence[np.dtype], results: Sequence[np.dt
     random = np.random.default_rng(0)
     shapes = kernel.argument_shapes
     drawn = [_draw(random, dtype, shape) for dtype, shape in zip(arguments, shapes, strict=True)]
-    # The caller may be tracing another function.
-    with jax.ensure_compile_time_eval():
+    # The caller may be tracing another function, and forbid that arrays are copied to a device.
+    with jax.ensure_compile_time_eval(), jax.transfer_guard("allow"):
         by_xla = jax.jit(jax.vmap(lambda *passed: kernel.fallback(*passed)))
         ours = _run(jax.jit(jax.vmap(lambda *passed: kernel.as_function()(passed))), drawn, results)
         theirs = _run(by_xla, drawn, results)

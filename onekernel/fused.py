@@ -41,7 +41,7 @@ from jaxtyping import Array, PyTree
 from onekernel.backends import default_backend
 from onekernel.check import check
 from onekernel.errors import KernelError, UnsupportedError
-from onekernel.kernel import Kernel, called_by, varying_axes
+from onekernel.kernel import Kernel, called_by, is_debugging, varying_axes
 from onekernel.lower import scalarize_part
 
 CHECK = "ONEKERNEL_CHECK"
@@ -202,8 +202,9 @@ class Fused:
         return self._find(structure, [_shape(x) for x in leaves])
 
     def _is_allowed(self) -> bool:
-        # With `jax_disable_jit` the user wants to see every operation.
-        return not jax.config.values["jax_disable_jit"] and self._may_be_kernel()
+        # With these settings the user wants to see every operation.
+        is_watched = jax.config.values["jax_disable_jit"] or is_debugging()
+        return not is_watched and self._may_be_kernel()
 
     def _report(self, error: UnsupportedError) -> None:
         """Do what the user wants where there is no kernel."""

@@ -241,6 +241,28 @@ def test_numbers_of_another_width_are_named(dtype):
         fuse(lambda x: x * 2, on_unsupported="raise")(jnp.ones(2, dtype))
 
 
+@pytest.mark.parametrize("way", ["jit", "vmap", "one instance"])
+def test_with_debug_nans_jax_names_the_operation(way):
+    one = fuse(lambda x: jnp.sqrt(jnp.log(x)))
+    ways = {
+        "jit": lambda: jax.jit(jax.vmap(one))(-np.ones(3, np.float32)),
+        "vmap": lambda: jax.vmap(one)(-np.ones(3, np.float32)),
+        "one instance": lambda: one(-1.0),
+    }
+    ways[way]()
+    with jax.debug_nans(True), pytest.raises(FloatingPointError, match="encountered in log"):
+        ways[way]()
+    with jax.debug_infs(True), pytest.raises(FloatingPointError, match="encountered in log"):
+        one(0.0)
+
+
+def test_a_check_passes_where_transfers_are_forbidden():
+    x = jnp.asarray(states())
+    with jax.transfer_guard("disallow"):
+        ours = jax.jit(jax.vmap(fuse(lorenz)))(x)
+    same(ours, jax.vmap(lorenz)(x))
+
+
 def test_a_platform_without_kernels_is_told(monkeypatch):
     break_kernels(monkeypatch)
     with pytest.warns(UserWarning, match="^XLA computes lorenz, slower: it is broken$"):
