@@ -104,8 +104,11 @@ def fuse(
         `on_unsupported` says.
 
     Raises:
+      TypeError: `function` is no function.
       ValueError: `on_unsupported` is none of these.
     """
+    if not (function is None or callable(function)):
+        raise TypeError(f"fuse takes a function, not {function!r}")
     if not callable(on_unsupported) and on_unsupported not in ("warn", "xla", "raise"):
         choices = "'warn', 'xla', 'raise' or a function"
         raise ValueError(f"on_unsupported = {on_unsupported!r}: choose {choices}")
@@ -519,4 +522,6 @@ def _shape_without_key(x: ShapedArray) -> ShapedArray:
 
 def _shape(x: PyTree) -> ShapedArray:
     """Return shape and dtype of a leaf, which may be a number of Python."""
-    return ShapedArray(x.shape, x.dtype) if hasattr(x, "shape") else _as_array(x).aval
+    # NumPy's numbers of 64 bits are passed with 32, unless JAX is told to take them as they are.
+    is_abstract = hasattr(x, "shape") and not isinstance(x, np.ndarray | np.generic)
+    return ShapedArray(x.shape, x.dtype) if is_abstract else _as_array(x).aval

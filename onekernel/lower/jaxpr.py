@@ -156,7 +156,9 @@ def scalarize_part(
     # Reject what cannot be lowered at all.
     if closed.effects:
         # For example `jax.debug.print`, on which no result depends.
-        raise UnsupportedError(f"an effect: {', '.join(map(str, closed.effects))}")
+        error = UnsupportedError(f"an effect: {', '.join(map(str, closed.effects))}")
+        error.place = next((_place(x) for x in closed.jaxpr.eqns if x.effects), None)
+        raise error
     # Start with the program's arguments, each split into scalars of the graph.
     graph = ExprGraph(finite=finite, approximate=approximate)
     lowering = _JaxprLowering(graph)

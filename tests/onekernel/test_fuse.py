@@ -312,6 +312,25 @@ def test_explain_tells_what_a_kernel_is(capsys):
     }
 
 
+def test_explain_takes_numbers_of_numpy_as_a_call_does(capsys):
+    onekernel.explain(lorenz, np.ones(3), rho=np.float64(20))
+    assert capsys.readouterr().out.startswith("lorenz is one kernel\n")
+
+
+@pytest.mark.parametrize("wrong", [3, "raise"])
+def test_what_is_no_function_is_refused(wrong):
+    with pytest.raises(TypeError, match=f"^fuse takes a function, not {wrong!r}$"):
+        fuse(wrong)
+
+
+def test_an_effect_is_told_with_its_line():
+    def shown(x):
+        return jax.lax.fori_loop(0, 3, lambda _, y: (jax.debug.print("{}", y), 2 * y)[1], x)
+
+    with pytest.raises(UnsupportedError, match=r"^an effect: Debug \(.*test_fuse.py:\d+.*\)$"):
+        fuse(shown, on_unsupported="raise")(1.0)
+
+
 def test_explain_tells_what_stands_in_the_way(capsys):
     onekernel.explain(spectrum, np.ones(4, np.float32))
     out = capsys.readouterr().out
