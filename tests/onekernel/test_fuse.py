@@ -241,6 +241,21 @@ def test_numbers_of_another_width_are_named(dtype):
         fuse(lambda x: x * 2, on_unsupported="raise")(jnp.ones(2, dtype))
 
 
+def test_a_batch_without_vmap_is_refused_before_it_is_lowered():
+    def double(x):
+        return 2 * x
+
+    message = "^arguments and results of 240,000 bytes for each instance, more than 65,536$"
+    with pytest.raises(UnsupportedError, match=message):
+        fuse(double, on_unsupported="raise")(jnp.ones((10_000, 3)))
+
+    def trace(x):
+        return jax.lax.scan(lambda x, _: (x + 0.01 * lorenz(x),) * 2, x, length=6000)
+
+    with pytest.raises(UnsupportedError, match="results of 72,024 bytes"):
+        fuse(trace, on_unsupported="raise")(jnp.ones(3))
+
+
 @pytest.mark.parametrize("way", ["jit", "vmap", "one instance"])
 def test_with_debug_nans_jax_names_the_operation(way):
     one = fuse(lambda x: jnp.sqrt(jnp.log(x)))
