@@ -222,6 +222,11 @@ class Backend(Protocol):
         ...
 
 
+def is_debugging() -> bool:
+    """Return whether JAX looks for the operation that computes NaN or infinity: a kernel is one."""
+    return jax.config.values["jax_debug_nans"] or jax.config.values["jax_debug_infs"]
+
+
 def called_by(equation: JaxprEqn) -> Kernel | None:
     """Return the kernel that an equation of a jaxpr calls; None: it does something else."""
     return equation.params["kernel"] if equation.primitive is _kernel_p else None
@@ -248,8 +253,9 @@ def make_primitive(
 
     @primitive.def_impl
     def run(*arrays: Array, **parameters: object) -> list[Array]:
-        # Enable jit here: within `jax.disable_jit` this function would call itself.
-        with jax.disable_jit(False):
+        # Enable jit here: within `jax.disable_jit` this function would call itself, and so it would
+        # where JAX runs it again to find the operation that computed NaN or infinity.
+        with jax.disable_jit(False), jax.debug_nans(False), jax.debug_infs(False):
             return compiled(*arrays, **parameters)
 
     def batch(

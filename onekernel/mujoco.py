@@ -35,6 +35,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from onekernel.backends import Kernel, default_backend
 from onekernel.errors import KernelError, UnsupportedError
+from onekernel.kernel import is_debugging
 from onekernel.lower import scalarize
 
 # MJX prints two lines where its optional part Warp is not installed.
@@ -159,7 +160,9 @@ class FusedMjx:
         carry = {name: x for name, x in words.items() if name in _CARRIED}
         held = {name: x for name, x in words.items() if name not in _CARRIED}
         found = self._find_kernel((*held,))
-        if not isinstance(found, UnsupportedError):
+        if is_debugging():
+            step = self._xla_step
+        elif not isinstance(found, UnsupportedError):
             step = found.as_step()
         elif self._on_unsupported == "raise":
             raise found

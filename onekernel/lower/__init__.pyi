@@ -1,3 +1,4 @@
+from .control_flow import MAX_ARRAY_BYTES as MAX_ARRAY_BYTES
 from .evaluation import evaluate as evaluate
 from .jaxpr import ScalarProgram as ScalarProgram
 from .jaxpr import scalarize as scalarize

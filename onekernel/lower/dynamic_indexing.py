@@ -261,14 +261,24 @@ def _all_inside(
     return inside
 
 
-def _scatter(
+def scatter(
     graph: ExprGraph,
     equation: JaxprEqn,
     x: ScalarArray,
     indices: ScalarArray,
     updates: ScalarArray,
-    op: str | None = None,
+    combine: Callable[[Scalar, Scalar], Scalar],
 ) -> ScalarArray:
+    """Write windows at indices that may depend on the program's inputs.
+
+    Args:
+      graph: the graph.
+      equation: the equation.
+      x: the array.
+      indices: the index of each window.
+      updates: the windows.
+      combine: a function of an old number and its update that returns the new number.
+    """
     # The dimension numbers of a scatter are those of the gather that reads the same windows.
     dims = jax.lax.GatherDimensionNumbers(*equation.params["dimension_numbers"])
     fixed = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
@@ -276,9 +286,6 @@ def _scatter(
     sizes = [1 if axis in fixed else next(window) for axis in range(x.ndim)]
     # A scatter leaves out windows that reach beyond the array, unless it is to move them inside.
     is_clipped = "CLIP" in str(equation.params["mode"])
-
-    def combine(old: Scalar, new: Scalar) -> Scalar:
-        return new if op is None else graph.apply(op, old, new)
 
     # Bring the axes of the windows to the end, as `_with_offsets` moves them away.
     batch = [axis for axis in range(updates.ndim) if axis not in dims.offset_dims]
@@ -296,6 +303,17 @@ def _scatter(
     return x
 
 
+def _scatter_by(
+    op: str,
+    graph: ExprGraph,
+    equation: JaxprEqn,
+    x: ScalarArray,
+    indices: ScalarArray,
+    updates: ScalarArray,
+) -> ScalarArray:
+    return scatter(graph, equation, x, indices, updates, functools.partial(graph.apply, op))
+
+
 def _sort(graph: ExprGraph, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
     """Sort with a sorting network, which exchanges neighbours.
 
@@ -305,9 +323,10 @@ def _sort(graph: ExprGraph, equation: JaxprEqn, *operands: ScalarArray) -> list[
     axis, keys = equation.params["dimension"], equation.params["num_keys"]
     # Bring the axis to the front and merge all others: each lane is sorted on its own, by the same
     # comparisons for all operands.
-    columns = [np.moveaxis(x, axis, 0).reshape(x.shape[axis], -1).copy() for x in operands]
-    count = operands[0].shape[axis]
-    for lane in range(columns[0].shape[1] if count else 0):
+    shape = np.moveaxis(operands[0], axis, 0).shape
+    count, lanes = shape[0], math.prod(shape[1:])
+    columns = [np.moveaxis(x, axis, 0).reshape(count, lanes).copy() for x in operands]
+    for lane in range(lanes if count else 0):
         rows = [[column[i, lane] for column in columns] for i in range(count)]
         # Constant keys are sorted now; no comparison is left for the program.
         if all(is_constant(x) for row in rows for x in row[:keys]):
@@ -317,10 +336,7 @@ def _sort(graph: ExprGraph, equation: JaxprEqn, *operands: ScalarArray) -> list[
         for i, row in enumerate(rows):
             for column, x in zip(columns, row, strict=True):
                 column[i, lane] = x
-    shapes = [np.moveaxis(x, axis, 0).shape for x in operands]
-    return [
-        np.moveaxis(x.reshape(shape), 0, axis) for x, shape in zip(columns, shapes, strict=True)
-    ]
+    return [np.moveaxis(x.reshape(shape), 0, axis) for x in columns]
 
 
 def _order(graph: ExprGraph, a: Sequence[Scalar], b: Sequence[Scalar]) -> int:
@@ -367,29 +383,42 @@ def _is_before(graph: ExprGraph, a: Sequence[Scalar], b: Sequence[Scalar]) -> Sc
 
 
 def _top_k(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> list[ScalarArray]:
-    """Sort the last axis from the largest number to the smallest, and keep the first ones."""
+    """Sort the last axis from the largest number to the smallest, and keep the first ones.
+
+    As in XLA, -0 is below 0, and NaN is above or below all numbers, by its sign.
+    """
     count = equation.params["k"]
     kind = dtype_of(equation.outvars[1]).type
     found = []
-    for numbers in x.reshape(-1, x.shape[-1]):
+    for numbers in x.reshape(math.prod(x.shape[:-1]), x.shape[-1]):
         # Sort the numbers together with their places, which are the second result.
-        rows = [[number, kind(i)] for i, number in enumerate(numbers)]
-        rows = _in_order(graph, rows, lambda a, b: _is_before(graph, a[:1], b[:1]))
+        rows = [[_rank(graph, number), number, kind(i)] for i, number in enumerate(numbers)]
+        rows = _in_order(graph, rows, lambda a, b: graph.apply("lt", a[0], b[0]))
         found += rows[:count]
     shape = (*x.shape[:-1], count)
-    return [scalar_array((row[i] for row in found), shape) for i in range(2)]
+    return [scalar_array((row[i] for row in found), shape) for i in (1, 2)]
+
+
+def _rank(graph: ExprGraph, x: Scalar) -> Scalar:
+    """Return a whole number that orders floats by their bits."""
+    if x.dtype.kind != "f":
+        return x
+    word = graph.apply("bitcast", x)
+    # Of negative floats, the larger ones have the smaller bits beside the sign.
+    inverted = graph.apply("xor", word, np.int32(2**31 - 1))
+    return graph.select(graph.apply("lt", word, np.int32(0)), word, inverted)
 
 
 DYNAMIC_RULES: dict[str, Rule] = {
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "gather": gather,
-    "scatter": _scatter,
-    "scatter-add": functools.partial(_scatter, op="add"),
-    "scatter-max": functools.partial(_scatter, op="max"),
-    "scatter-min": functools.partial(_scatter, op="min"),
-    "scatter-mul": functools.partial(_scatter, op="mul"),
-    "scatter-sub": functools.partial(_scatter, op="sub"),
+    "scatter": functools.partial(scatter, combine=lambda old, new: new),
+    "scatter-add": functools.partial(_scatter_by, "add"),
+    "scatter-max": functools.partial(_scatter_by, "max"),
+    "scatter-min": functools.partial(_scatter_by, "min"),
+    "scatter-mul": functools.partial(_scatter_by, "mul"),
+    "scatter-sub": functools.partial(_scatter_by, "sub"),
     "sort": _sort,
     "top_k": _top_k,
 }

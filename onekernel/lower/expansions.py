@@ -103,6 +103,11 @@ def _cbrt(x: Array) -> Array:
     return jnp.where(is_end, x, _with_sign(x, root))
 
 
+def _polynomial(x: Array, *coefficients: Array) -> Array:
+    # Horner's rule; the coefficient of the highest power comes last.
+    return functools.reduce(lambda sum, a: sum * x + a, reversed(coefficients))
+
+
 def power(x: Array, y: Array) -> Array:
     """Compute x to the power of y, to 1e-5 of the result."""
     y = y.astype(jnp.float32)
@@ -339,6 +344,8 @@ EXPANSIONS: dict[str, Callable[..., Array]] = {
     "nextafter": _nextafter,
     # The derivative of tanh has it since JAX 0.12.
     "one_minus_square": lambda x: (1.0 - x) * (1.0 + x),
+    # `jnp.polyval` and functions of statistics have it since JAX 0.12.
+    "polynomial": _polynomial,
     "population_count": _population_count,
     "reduce_precision": _reduce_precision,
     "shift_right_arithmetic": _shift_right_arithmetic,

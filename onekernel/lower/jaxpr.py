@@ -40,7 +40,7 @@ from numpy.typing import ArrayLike
 from onekernel.errors import UnsupportedError
 from onekernel.lower.arithmetic import ARITHMETIC_RULES, bitcast, elementwise
 from onekernel.lower.control_flow import ControlFlow, check_bytes
-from onekernel.lower.dynamic_indexing import DYNAMIC_RULES
+from onekernel.lower.dynamic_indexing import DYNAMIC_RULES, scatter
 from onekernel.lower.expansions import EXPANSIONS, power, round_away_from_zero
 from onekernel.lower.indexing import (
     RULES,
@@ -49,6 +49,7 @@ from onekernel.lower.indexing import (
     constant_array,
     dtype_of,
     full_array,
+    scalar_array,
     shape_of,
 )
 from onekernel.lower.linear_algebra import MAX_ROWS, expansion
@@ -57,6 +58,7 @@ from onekernel.lower.scalar_ir import (
     EVALUATE,
     SIMPLE_POWERS,
     ExprGraph,
+    Scalar,
     is_constant,
     length_of,
 )
@@ -154,7 +156,9 @@ def scalarize_part(
     # Reject what cannot be lowered at all.
     if closed.effects:
         # For example `jax.debug.print`, on which no result depends.
-        raise UnsupportedError(f"an effect: {', '.join(map(str, closed.effects))}")
+        error = UnsupportedError(f"an effect: {', '.join(map(str, closed.effects))}")
+        error.place = next((_place(x) for x in closed.jaxpr.eqns if x.effects), None)
+        raise error
     # Start with the program's arguments, each split into scalars of the graph.
     graph = ExprGraph(finite=finite, approximate=approximate)
     lowering = _JaxprLowering(graph)
@@ -316,6 +320,20 @@ class _JaxprLowering:
         return self.lower(equation.params["jaxpr"], operands)
 
     _pjit = _jit
+
+    def _scatter(
+        self, equation: JaxprEqn, *operands: ScalarArray
+    ) -> ScalarArray | list[ScalarArray]:
+        if equation.params["update_jaxpr"] is None:
+            return DYNAMIC_RULES["scatter"](self._graph, equation, *operands)
+        # `x.at[i].apply(function)` computes the new numbers by a function of the old ones.
+        closed = ClosedJaxpr(equation.params["update_jaxpr"], equation.params["update_consts"])
+
+        def combine(old: Scalar, new: Scalar) -> Scalar:
+            (result,) = self.lower(closed, [scalar_array([x], ()) for x in (old, new)])
+            return result.item()
+
+        return scatter(self._graph, equation, *operands, combine=combine)
 
     def _custom_jvp_call(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         return self.lower(equation.params["call_jaxpr"], operands)

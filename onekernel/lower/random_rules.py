@@ -16,7 +16,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from onekernel.errors import UnsupportedError
-from onekernel.lower.indexing import Rule, ScalarArray, scalar_array, shape_of
+from onekernel.lower.indexing import Rule, ScalarArray, dtype_of, scalar_array, shape_of
 from onekernel.lower.scalar_ir import ExprGraph, Scalar
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -87,6 +87,17 @@ def _threefry2x32(
     ]
 
 
+def _seed(graph: ExprGraph, equation: JaxprEqn, seeds: ScalarArray) -> ScalarArray:
+    if equation.params["impl"].name != "threefry2x32":
+        raise UnsupportedError("random numbers other than those of Threefry")
+    # A key is a seed of 64 bits. Only a constant has so many, and the others are padded with zeros.
+    is_long = dtype_of(equation.invars[0]).itemsize == 8
+    firsts = (np.uint32((int(x) >> 32) % 2**32 if is_long else 0) for x in seeds.ravel())
+    return scalar_array(
+        map(Key, firsts, (graph.convert(x, _WORD) for x in seeds.ravel())), seeds.shape
+    )
+
+
 def _wrap(graph: ExprGraph, equation: JaxprEqn, words: ScalarArray) -> ScalarArray:
     pairs = words.reshape(-1, words.shape[-1])
     # Keys of other generators have more words.
@@ -140,6 +151,7 @@ RANDOM_RULES: dict[str, Rule] = {
     "random_bits": _bits,
     "random_clone": lambda graph, equation, key: key,
     "random_fold_in": _fold_in,
+    "random_seed": _seed,
     "random_split": _split,
     "random_unwrap": _unwrap,
     "random_wrap": _wrap,

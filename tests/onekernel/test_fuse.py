@@ -241,6 +241,43 @@ def test_numbers_of_another_width_are_named(dtype):
         fuse(lambda x: x * 2, on_unsupported="raise")(jnp.ones(2, dtype))
 
 
+def test_a_batch_without_vmap_is_refused_before_it_is_lowered():
+    def double(x):
+        return 2 * x
+
+    message = "^arguments and results of 240,000 bytes for each instance, more than 65,536$"
+    with pytest.raises(UnsupportedError, match=message):
+        fuse(double, on_unsupported="raise")(jnp.ones((10_000, 3)))
+
+    def trace(x):
+        return jax.lax.scan(lambda x, _: (x + 0.01 * lorenz(x),) * 2, x, length=6000)
+
+    with pytest.raises(UnsupportedError, match="results of 72,024 bytes"):
+        fuse(trace, on_unsupported="raise")(jnp.ones(3))
+
+
+@pytest.mark.parametrize("way", ["jit", "vmap", "one instance"])
+def test_with_debug_nans_jax_names_the_operation(way):
+    one = fuse(lambda x: jnp.sqrt(jnp.log(x)))
+    ways = {
+        "jit": lambda: jax.jit(jax.vmap(one))(-np.ones(3, np.float32)),
+        "vmap": lambda: jax.vmap(one)(-np.ones(3, np.float32)),
+        "one instance": lambda: one(-1.0),
+    }
+    ways[way]()
+    with jax.debug_nans(True), pytest.raises(FloatingPointError, match="encountered in log"):
+        ways[way]()
+    with jax.debug_infs(True), pytest.raises(FloatingPointError, match="encountered in log"):
+        one(0.0)
+
+
+def test_a_check_passes_where_transfers_are_forbidden():
+    x = jnp.asarray(states())
+    with jax.transfer_guard("disallow"):
+        ours = jax.jit(jax.vmap(fuse(lorenz)))(x)
+    same(ours, jax.vmap(lorenz)(x))
+
+
 def test_a_platform_without_kernels_is_told(monkeypatch):
     break_kernels(monkeypatch)
     with pytest.warns(UserWarning, match="^XLA computes lorenz, slower: it is broken$"):
@@ -257,10 +294,14 @@ def test_a_wrong_kernel_is_found_before_its_first_use(monkeypatch):
         return lowered(traced, arguments, [results[0]] * len(results), **options)
 
     monkeypatch.setattr(fused, "scalarize_part", wrong)
-    both = fuse(lambda x: (x.sum(), x.max()))
-    with pytest.raises(KernelError, match="result 1 of a kernel is not XLA's: ") as raised:
+    # The first number that differs is told, not the first of all.
+    both = fuse(lambda x: (x, jnp.where(jnp.arange(3) > 1, 123.0, x)))
+    message = r"^result 1 of a kernel is not XLA's: \S+ instead of 123 at \[2\] in 65 of 65 random"
+    with pytest.raises(KernelError, match=message) as raised:
         both(np.ones(3, np.float32))
     assert raised.value.kind == "check"
+    with pytest.raises(KernelError, match=r"^result 1 of a kernel is not XLA's: 1 instead of 0 in"):
+        fuse(lambda x: (x > x - 1, x > x + 1))(np.float32(1))
 
 
 def test_what_the_function_itself_makes_unsteady_is_not_called_wrong():
@@ -284,6 +325,25 @@ def test_explain_tells_what_a_kernel_is(capsys):
         *("operations", "reads", "writes", "traced and lowered in", "compiled in"),
         *("registers", "spilled"),
     }
+
+
+def test_explain_takes_numbers_of_numpy_as_a_call_does(capsys):
+    onekernel.explain(lorenz, np.ones(3), rho=np.float64(20))
+    assert capsys.readouterr().out.startswith("lorenz is one kernel\n")
+
+
+@pytest.mark.parametrize("wrong", [3, "raise"])
+def test_what_is_no_function_is_refused(wrong):
+    with pytest.raises(TypeError, match=f"^fuse takes a function, not {wrong!r}$"):
+        fuse(wrong)
+
+
+def test_an_effect_is_told_with_its_line():
+    def shown(x):
+        return jax.lax.fori_loop(0, 3, lambda _, y: (jax.debug.print("{}", y), 2 * y)[1], x)
+
+    with pytest.raises(UnsupportedError, match=r"^an effect: Debug \(.*test_fuse.py:\d+.*\)$"):
+        fuse(shown, on_unsupported="raise")(1.0)
 
 
 def test_explain_tells_what_stands_in_the_way(capsys):

@@ -128,3 +128,9 @@ def test_it_runs_where_nothing_is_to_be_compiled():
     with jax.disable_jit():
         result = made()({"x": jnp.arange(3.0), "n": jnp.zeros(())}, jnp.float32(3))
     np.testing.assert_array_equal(result["x"], [0, 9, 18])
+
+
+def test_jax_finds_what_is_not_finite_outside_of_it():
+    state = {"x": jnp.array([0, jnp.nan, 2]), "n": jnp.zeros(())}
+    with jax.debug_nans(True), pytest.raises(FloatingPointError, match="nan"):
+        jax.jit(made())(state, jnp.float32(3))

@@ -236,6 +236,13 @@ def test_what_mjx_cannot_do_is_named(option, said):
     assert "\n" not in str(caught.value)
 
 
+def test_debug_nans_finds_a_state_that_is_not_finite(falls):
+    state = falls.init(qvel=[np.nan])
+    falls(state, [])
+    with jax.debug_nans(True), pytest.raises(FloatingPointError, match="nan"):
+        falls(state, [])
+
+
 def test_wrong_arguments_are_named():
     model = mujoco.MjModel.from_xml_string(FALLS)
     with pytest.raises(TypeError, match=r"mj_model is a str, not a mujoco\.MjModel"):

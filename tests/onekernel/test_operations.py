@@ -132,6 +132,7 @@ ROWS = {
     "different": lambda x: jnp.unique(jnp.round(x), size=4),
     "the first": lambda x: jnp.argmax(x > 0.5),
     "moved": lambda x: jax.lax.pad(x, 0.0, [(-1, 2, 1)]),
+    "a polynomial": lambda x: (jnp.polyval(x[:3], x[3]), jnp.polyval(jnp.ones(12), x[1:] / 4)),
     "sums of pairs": lambda x: jax.lax.associative_scan(jnp.add, x),
 }
 
@@ -155,6 +156,14 @@ WHOLE_ROWS = {
     "largest of none": lambda x: jnp.max(x[:0], initial=-7),
 }
 
+NONE = {
+    "sorted": lambda x: jnp.sort(x[:0]),
+    "sorted rows": lambda x: jnp.sort(x.reshape(2, 3)[:, :0], axis=0),
+    "sorted columns": lambda x: jnp.argsort(x.reshape(2, 3)[:0], axis=0),
+    "the largest of none": lambda x: jax.lax.top_k(x[:0], 0),
+    "none of the largest": lambda x: jax.lax.top_k(x, 0),
+}
+
 INDEXED = {
     "one": lambda x, i: x[i],
     "several": lambda x, i: x[jnp.stack([i, i + 1, -i])],
@@ -167,6 +176,8 @@ INDEXED = {
     "set several": lambda x, i: x.at[jnp.stack([i, i + 1, i])].add(x[:3]),
     "multiplied": lambda x, i: x.at[i].mul(2.0),
     "raised": lambda x, i: x.at[i].max(0.5),
+    "computed": lambda x, i: x.at[i].apply(jnp.exp),
+    "computed several times": lambda x, i: x.at[jnp.stack([i, 1, i])].apply(lambda y: 2 * y + 1),
     "replaced": lambda x, i: jax.lax.dynamic_update_slice(x, x[:2], (i,)),
     "rolled": lambda x, i: jnp.roll(x, i),
     "found": lambda x, i: jnp.searchsorted(jnp.cumsum(jnp.abs(x)), i.astype(jnp.float32)),
@@ -219,6 +230,7 @@ GROUPS = {
     "angles": (ANGLES, [floats(3) * 100]),
     "two numbers": (BINARY, [floats(3, odd=True), floats(3, seed=1, odd=True)[::-1].copy()]),
     "rows": (ROWS, [floats(6, odd=True)]),
+    "nothing": (NONE, [floats(6)]),
     "indices": (INDEXED, [floats(7), wholes()]),
     "matrices": (MATRICES, [conditioned(4)]),
     "derivatives": (DERIVATIVES, [floats(6)]),
@@ -274,6 +286,16 @@ def test_a_sort_keeps_the_order_of_equal_numbers():
     x, marks = np.round(floats(9)), np.broadcast_to(np.arange(9, dtype=np.int32), (COUNT, 9))
     sort = functools.partial(jax.lax.sort, num_keys=1)
     found, expected = both({"pairs": lambda x, y: sort((x, y))}, [x, marks.copy()])
+    assert_close(found, expected)
+
+
+def test_the_largest_numbers_are_ordered_by_their_bits():
+    rows = [[-0.0, 0.0, -0.0], [np.nan, 1, -np.nan], [-np.nan, np.inf, np.nan], [-np.inf, -3, -4]]
+    functions = {
+        "computed": lambda x: jax.lax.top_k(x, 3),
+        "known": lambda x: [jax.lax.top_k(jnp.array(row, jnp.float32), 3) for row in rows],
+    }
+    found, expected = both(functions, [np.array(rows, np.float32)])
     assert_close(found, expected)
 
 

@@ -178,3 +178,36 @@ def test_the_older_order_of_bits_is_refused_and_drawn_by_jax(name):
         with pytest.raises(UnsupportedError, match="without jax_threefry_partitionable"):
             scalarize(EXACT[name], KEY)
         check_as_it_is(EXACT[name], KEYS[:5])
+
+
+SEEDS = np.int32([0, 1, -1, 7, 2**31 - 1, -(2**31)])
+
+
+def test_a_key_begins_with_a_seed():
+    def keys(seed):
+        constant = jax.random.PRNGKey(0), jax.random.PRNGKey(-5), jax.random.key_data(seedless())
+        many = jax.vmap(jax.random.PRNGKey)(seed + jnp.arange(3))
+        return jax.random.PRNGKey(seed), jax.random.PRNGKey(seed.astype(jnp.uint32)), many, constant
+
+    def seedless():
+        return jax.random.key(3)
+
+    ours = jax.vmap(fuse(keys, on_unsupported="raise"))(SEEDS)
+    jax.tree.map(np.testing.assert_array_equal, ours, jax.vmap(keys)(SEEDS))
+
+
+def test_a_constant_seed_may_have_64_bits():
+    def keys(x):
+        return x, jax.random.PRNGKey(2**40 + 5), jax.random.PRNGKey(-7)
+
+    with jax.enable_x64(True):
+        ours = jax.vmap(fuse(keys, on_unsupported="raise"))(SEEDS)
+        jax.tree.map(np.testing.assert_array_equal, ours, jax.vmap(keys)(SEEDS))
+
+
+def test_a_seed_of_another_generator_is_named():
+    function = fuse(
+        lambda seed: jax.random.key_data(jax.random.key(seed, impl="rbg")), on_unsupported="raise"
+    )
+    with pytest.raises(UnsupportedError, match=r"numbers other than those of Threefry \(.*rules"):
+        function(3)
