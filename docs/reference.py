@@ -29,10 +29,13 @@ from ruamel.yaml import YAML
 from jetbot_mjx.config import (
     CHANGEABLE_ON_RESUME,
     QUANTITIES,
+    Caster,
     Config,
     ConfigError,
     LookParams,
+    MjcfRobotConfig,
     RandomizationConfig,
+    RobotConfig,
     RobotParams,
     load_config,
     parse_config,
@@ -124,7 +127,10 @@ def _walk(
     for key, value in schema["properties"].items():
         path = f"{name}.{key}".lstrip(".")
         field = model.model_fields[key]
-        if "$ref" in value:
+        if path == "robot":
+            # One that is a model of its own is a table of its page.
+            below.append((path, RobotConfig, shared["RobotConfig"], shared, defaults[key]))
+        elif "$ref" in value:
             inner = shared[value["$ref"].rpartition("/")[2]]
             below.append((path, field.annotation, inner, shared, defaults[key]))
         else:
@@ -179,12 +185,27 @@ def _primitives() -> Iterator[str]:
         yield f"| {kind} | {' '.join(f'`{name}`' for name in names)} |"
 
 
+def _own_model() -> Iterator[str]:
+    """Yield the lines of a table of the settings of a robot that is a model of its own."""
+    yield "| key | default | meaning |"
+    yield "|---|---|---|"
+    meanings = _meanings(MjcfRobotConfig)
+    for key, field in MjcfRobotConfig.model_fields.items():
+        default = "-" if field.is_required() else f"`{as_yaml(field.get_default())}`"
+        yield f"| `{key}` | {default} | {meanings[key]} |"
+
+
 _TABLES = {
+    "own_model": _own_model,
     "robot_ranges": lambda: _ranges_in("real_jetbot", RobotParams),
     "look_ranges": lambda: _ranges_in("camera_real", LookParams),
     "robustness_values": _robustness_values,
     "primitives": _primitives,
 }
+
+
+_PARTS = {"Caster": Caster}
+"""Sections that are items of lists."""
 
 
 def with_tables(text: str) -> str:
@@ -196,6 +217,8 @@ def _kind(schema: Mapping[str, Any], bounds: Sequence[str]) -> str:
     """Return a type and its bounds in words."""
     if "anyOf" in schema:
         return ", or ".join(_kind(one, bounds) for one in schema["anyOf"])
+    if "$ref" in schema:
+        return f"section with {', '.join(_PARTS[schema['$ref'].rpartition('/')[2]].model_fields)}"
     if "enum" in schema:
         return " or ".join(f"`{value}`" for value in schema["enum"])
     match schema["type"]:

@@ -19,6 +19,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "runs": ("list_runs", "list your runs, and those that come with the package"),
     "new-task": ("new_task", "write a task to start from"),
     "check-env": ("check_env", "check a task before it is trained"),
+    "new-robot": ("new_robot", "write a robot to start from"),
+    "check-robot": ("check_robot", "check a robot, and tell what a step of it costs"),
     "plan": ("plan", "predict the memory that a training needs"),
     "tune": ("tune", "search for hyperparameters, many trials at once"),
     "export": ("export", "write a policy to files that run without this package"),

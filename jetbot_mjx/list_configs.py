@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, path in shipped_configs().items():
         config = load_config(path)
         print(
-            f"{name:18} {config.robot.preset:6} {config.task.observation:11}"
+            f"{name:18} {config.robot.label:9} {config.task.observation:11}"
             f" {config.ppo.num_timesteps:>13,} steps in {config.ppo.num_envs:>6,} environments"
             f"{', randomized' if config.randomization.drawn else ''}"
         )

@@ -359,20 +359,8 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
     Raises:
       UnsupportedError: an operation cannot be lowered, or there are several kernels in it.
     """
-    # A kernel without arguments has no instances.
     arguments, results = _arguments(traced, places), traced.jaxpr.outvars
-    if not arguments:
-        raise UnsupportedError("a function of nothing")
-    for dtype in _dtypes([*arguments, *results]):
-        if dtype not in _DTYPES:
-            raise UnsupportedError(f"arguments or results of {dtype}")
-    # LLVM takes 10 s for a kernel that reads and writes 10,000 numbers, and 46 s for 40,000.
-    count = 4 * sum(math.prod(x.aval.shape) for x in [*arguments, *results])
-    if count > MAX_ARRAY_BYTES:
-        raise UnsupportedError(
-            f"arguments and results of {count:,} bytes for each instance, more than"
-            f" {MAX_ARRAY_BYTES:,}"
-        )
+    _check_passed(arguments, results)
     # Functions around a step test whether its state is finite, so here NaN must stay NaN.
     lower = functools.partial(scalarize_part, traced, words=True, finite=False)
     calls = [x for x in traced.jaxpr.eqns if called_by(x) is not None]
@@ -411,6 +399,23 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
         argument_dtypes=_passed_dtypes(arguments),
         result_dtypes=_passed_dtypes(results),
     )
+
+
+def _check_passed(arguments: Sequence[Var], results: Sequence[Var | Literal]) -> None:
+    """Raise an error if a kernel cannot have these arguments and results."""
+    # A kernel without arguments has no instances.
+    if not arguments:
+        raise UnsupportedError("a function of nothing")
+    for dtype in _dtypes([*arguments, *results]):
+        if dtype not in _DTYPES:
+            raise UnsupportedError(f"arguments or results of {dtype}")
+    # LLVM takes 10 s for a kernel that reads and writes 10,000 numbers, and 46 s for 40,000.
+    count = 4 * sum(math.prod(x.aval.shape) for x in [*arguments, *results])
+    if count > MAX_ARRAY_BYTES:
+        raise UnsupportedError(
+            f"arguments and results of {count:,} bytes for each instance, more than"
+            f" {MAX_ARRAY_BYTES:,}"
+        )
 
 
 def _arguments(traced: ClosedJaxpr, places: Sequence[int]) -> list[Var]:

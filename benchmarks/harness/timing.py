@@ -17,13 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt32
 
-from jetbot_mjx.envs.robot_model import WHEEL_RADIUS
+from jetbot_mjx.config import RobotConfig
 from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.errors import UserError
 
 WARM_UP_CALLS = 3  # GPUs record their command graphs in the second call
 REPEAT_SECONDS = 0.25  # [s] a shorter repeat would time the dispatch
-Z_RANGE = (0.5 * WHEEL_RADIUS, 1.5 * WHEEL_RADIUS)  # [m] axle of a robot on its wheels
+_RADIUS = RobotConfig().wheel_radius
+Z_RANGE = (0.5 * _RADIUS, 1.5 * _RADIUS)  # [m] axle of a robot on its wheels
 
 
 class Row(NamedTuple):

@@ -65,18 +65,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import CONFIGS, RESULTS
 from jetbot_mjx import cli
 from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.config import Config, load_config, parse_config
+from jetbot_mjx.config import Config, RobotConfig, load_config, parse_config
 from jetbot_mjx.devices import compiler_options, require_device, use_compilation_cache
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.physics import Physics
-from jetbot_mjx.envs.robot_model import (
-    CONTROLLER_WHEEL_RADIUS,
-    CONTROLLER_WHEEL_SEPARATION,
-    QPOS_QUAT,
-    QVEL_ANGULAR_B,
-    QVEL_LINEAR_W,
-)
+from jetbot_mjx.envs.robot_model import QPOS_QUAT, QVEL_ANGULAR_B, QVEL_LINEAR_W
 from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
 from jetbot_mjx.runs import Setup
@@ -88,6 +82,7 @@ from onekernel.aot.program_cache import ProgramCache
 
 TRAINERS = ("brax", "resumable")
 _MOST_SIGNS = 100_000
+_ROBOT = RobotConfig()
 
 ADAPTIVE_KL = {
     "learning_rate_schedule": "ADAPTIVE_KL",
@@ -121,8 +116,9 @@ class Unicycle(Physics):
     ) -> PhysicsState:
         """Integrate the commanded wheel speeds over one environment step."""
         dt = self._config.ctrl_dt
-        left, right = CONTROLLER_WHEEL_RADIUS * ctrl
-        speed, yaw_rate = 0.5 * (left + right), (right - left) / CONTROLLER_WHEEL_SEPARATION
+        left, right = _ROBOT.controller_wheel_radius * ctrl
+        speed = 0.5 * (left + right)
+        yaw_rate = (right - left) / _ROBOT.controller_wheel_separation
         heading = kinematics.yaw(state.qpos[QPOS_QUAT]) + yaw_rate * dt
         zero = jnp.zeros(())
         velocity = speed * jnp.stack([jnp.cos(heading), jnp.sin(heading), zero])

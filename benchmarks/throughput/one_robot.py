@@ -11,15 +11,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, RobotConfig
 from jetbot_mjx.envs.robot_model import (
-    CONTROLLER_WHEEL_RADIUS,
-    CONTROLLER_WHEEL_SEPARATION,
     QPOS_QUAT,
     QPOS_XYZ,
     QVEL_ANGULAR_B,
     QVEL_LINEAR_W,
-    ROBOTS,
     make_mj_model,
 )
 from jetbot_mjx.envs.task import GOAL_HEIGHT
@@ -27,15 +24,18 @@ from jetbot_mjx.envs.task import GOAL_HEIGHT
 
 def make_physics_model(config: Config) -> mujoco.MjModel:
     """Return the C model from which MJX's is made: same robot, time step and solver settings."""
-    return make_mj_model(ROBOTS[config.robot.preset], config.physics, visual=False)
+    return make_mj_model(config.robot, config.physics, visual=False)
 
 
 def wheel_targets(config: Config, actions: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
     """Return the wheel speeds (left, right) [rad/s] that actions in [-1, 1]² command."""
     drive, turn = np.moveaxis(np.clip(actions, -1.0, 1.0), -1, 0)
     speed = 0.5 * (drive + 1.0) * config.task.max_speed
-    difference = 0.5 * turn * config.task.max_yaw_rate * CONTROLLER_WHEEL_SEPARATION
-    return np.stack([speed - difference, speed + difference], axis=-1) / CONTROLLER_WHEEL_RADIUS
+    robot = config.robot
+    assert isinstance(robot, RobotConfig)
+    difference = 0.5 * turn * config.task.max_yaw_rate * robot.controller_wheel_separation
+    wheels = np.stack([speed - difference, speed + difference], axis=-1)
+    return wheels / robot.controller_wheel_radius
 
 
 class OneRobot:

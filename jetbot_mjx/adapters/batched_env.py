@@ -114,12 +114,12 @@ class BatchedEnv:
         """Start a step on the device, without waiting for it.
 
         Args:
-          actions: Actions of shape (n, 2), in [-1, 1].
+          actions: Actions of shape (n, action_size), in [-1, 1].
 
         Raises:
           UserError: The actions have another shape.
         """
-        actions = as_actions(actions, (self.num_envs, 2))
+        actions = as_actions(actions, (self.num_envs, self.env.action_size))
         self._state, self._results = self._step(self._state, actions)
 
     def finish(self) -> Steps:

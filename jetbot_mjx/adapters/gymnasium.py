@@ -108,7 +108,9 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
           ResetNeeded: There was no `reset` yet.
         """
         self._require_reset("step")
-        obs, reward, terminated, success, finite = self.robot.step(as_actions(action, (2,)))
+        obs, reward, terminated, success, finite = self.robot.step(
+            as_actions(action, (self.robot.env.action_size,))
+        )
         self._steps += 1
         out_of_time = self._steps >= self.config.task.episode_length
         truncated = not terminated and (out_of_time or not finite)

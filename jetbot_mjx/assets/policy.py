@@ -152,11 +152,19 @@ def wheel_speeds(action: np.ndarray) -> np.ndarray:
     Args:
       action: Action of shape [2] or [n, 2], in [-1, 1].
 
+    Of a car, it is the wheel speed v / r in the middle of the rear axle, and the curvature of the
+    path, a1 max_curvature.
+
     Returns:
-      (left, right) [rad/s], in the same shape.
+      (left, right) [rad/s], in the same shape; of a car (wheel speed [rad/s], curvature [1/m]).
     """
     about = ABOUT["controller"]
+    if "action_size" in about:  # only the robot's own function knows what an action means
+        return action
     speed = np.float32(0.5) * (action[..., 0] + np.float32(1)) * np.float32(about["max_speed"])
+    if "max_curvature" in about:
+        curvature = action[..., 1] * np.float32(about["max_curvature"])
+        return np.stack([speed / np.float32(about["wheel_radius"]), curvature], axis=-1)
     turn = action[..., 1] * np.float32(0.5 * about["max_yaw_rate"] * about["wheel_separation"])
     radius = np.float32(about["wheel_radius"])
     return np.stack([(speed - turn) / radius, (speed + turn) / radius], axis=-1)
@@ -172,8 +180,8 @@ def check(path: str) -> float:
       The largest difference of any number, wheel speeds as a share of the fastest.
     """
     about = ABOUT["controller"]
-    turn = 0.5 * about["max_yaw_rate"] * about["wheel_separation"]
-    fastest = (about["max_speed"] + turn) / about["wheel_radius"]
+    turn = 0.5 * about.get("max_yaw_rate", 0.0) * about.get("wheel_separation", 0.0)
+    fastest = (about.get("max_speed", 1.0) + turn) / about.get("wheel_radius", 1.0)
     inputs, (wanted_action, wanted_wheels) = _recorded(path)
     worst = [0.0]
     # Piece by piece, since all images at once would fill the memory of a small computer.

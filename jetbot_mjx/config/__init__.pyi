@@ -15,7 +15,13 @@ from .ppo import NetworkConfig as NetworkConfig
 from .ppo import PPOConfig as PPOConfig
 from .randomization import QUANTITIES as QUANTITIES
 from .randomization import RandomizationConfig as RandomizationConfig
+from .robot import Caster as Caster
 from .robot import RobotConfig as RobotConfig
+from .robot_files import FOLDER as FOLDER
+from .robot_files import model_files as model_files
+from .robot_files import register as register
+from .robot_mjcf import MjcfRobotConfig as MjcfRobotConfig
+from .robot_mjcf import Sides as Sides
 from .robot_quantities import RobotParams as RobotParams
 from .run import CHANGEABLE_ON_RESUME as CHANGEABLE_ON_RESUME
 from .run import Config as Config

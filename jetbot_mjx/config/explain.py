@@ -4,7 +4,10 @@ from collections.abc import Mapping
 
 from pydantic_core import ErrorDetails
 
+from jetbot_mjx.config.errors import ConfigError
 from jetbot_mjx.config.keys import ALL_KEYS, likely_key
+from jetbot_mjx.config.robot_mjcf import MjcfRobotConfig
+from jetbot_mjx.config.run import ROBOT_KINDS
 from jetbot_mjx.errors import clipped, shown
 
 _MOST_SECTIONS = 8
@@ -26,6 +29,9 @@ def explain(error: ErrorDetails) -> str:
     """Return one line about pydantic's first error: the key, the value, and what is expected."""
     # Pydantic adds the name of a union's branch or the index in a tuple; keep only the keys.
     location = [clipped(str(part), 100) for part in error["loc"]]
+    is_model = location[:2] == ["robot", ROBOT_KINDS[1]]
+    if location[:1] == ["robot"] and location[1:2] and location[1] in ROBOT_KINDS:
+        del location[1]
     key = ".".join(location)
     value = shown(error["input"])
     if location[:2] == ["task", "options"] and len(location) > 2:
@@ -48,13 +54,20 @@ def explain(error: ErrorDetails) -> str:
             while isinstance(value, Mapping) and value and len(location) < _MOST_SECTIONS:
                 name, value = next(iter(value.items()))
                 location.append(clipped(str(name), 100))
-            return f"{'.'.join(location)} = {shown(value)} is unknown: {likely_key(location)}"
+            remedy = likely_key(location)
+            if is_model:
+                remedy = (
+                    f"a robot with a model of its own has {', '.join(MjcfRobotConfig.model_fields)}"
+                )
+            return f"{'.'.join(location)} = {shown(value)} is unknown: {remedy}"
         case "value_error":
-            prefix = f"{key}: " if key else ""
-            return prefix + str(error["ctx"]["error"]) if "ctx" in error else error["msg"]
+            # A file that the configuration names says itself what is wrong with it.
+            inner = error.get("ctx", {}).get("error", error["msg"])
+            prefix = f"{key}: " if key and not isinstance(inner, ConfigError) else ""
+            return f"{prefix}{inner}"
         case "model_type" | "model_attributes_type":
-            inside = next(one for one in ALL_KEYS if one.startswith(f"{key}."))
-            empty = error["input"] is None
+            inside = next((one for one in ALL_KEYS if one.startswith(f"{key}.")), None)
+            empty = error["input"] is None or inside is None
             remedy = "write its keys below it, indented" if empty else f"set {inside}"
             return f"{key} = {value} is not a section: {remedy}"
         case _:

@@ -7,7 +7,10 @@ from pydantic import ValidationError
 
 from jetbot_mjx.config.errors import ConfigError
 from jetbot_mjx.config.files import find_config
-from jetbot_mjx.config.run import Config
+from jetbot_mjx.config.robot import RobotConfig
+from jetbot_mjx.config.robot_files import FOLDER
+from jetbot_mjx.config.robot_mjcf import is_model
+from jetbot_mjx.config.run import Config, with_defaults
 from jetbot_mjx.config.task_modules import find_task_beside
 from jetbot_mjx.config.yaml_text import parse_any, read_yaml
 from jetbot_mjx.errors import clipped, shown
@@ -56,6 +59,7 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
             f"overrides = {shown(overrides)} is wrong: give settings and values, as in"
             " {'ppo.num_envs': 256}"
         )
+    overrides = _robots_first(overrides, values)
     if isinstance(overrides, Mapping):
         name += f" with {shown(dict(overrides))}" if overrides else ""
         for key, value in overrides.items():
@@ -65,10 +69,64 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
             given = f"--set {clipped(override)}"
             name += f" {given}"
             _apply_override(values, override, given)
+    if file is not None:
+        _find_robot_beside(file, values)
     resolved = parse_config(values, source=name)
     if file is not None:
         find_task_beside(file, resolved.task.name.partition(":")[0])
     return resolved
+
+
+def _with_robot_of_file(values: Mapping[str, object]) -> Mapping[str, object]:
+    """Take the measures that are not given from the robot's file; a stored run has them all.
+
+    Raises:
+      ConfigError: the file cannot be read, or a measure in it is unknown, of the wrong type or out
+        of bounds.
+    """
+    robot = values.get("robot")
+    if not isinstance(robot, Mapping) or not isinstance(robot.get("file"), str):
+        return values
+    if is_model(robot) or RobotConfig.model_fields.keys() <= robot.keys():
+        return values
+    path = Path(robot["file"])
+    own = read_yaml(path, "robot.file")
+    if "file" in own:
+        raise ConfigError(f"robot.file {path}: file = {shown(own['file'])}: it is one itself")
+    camera = own.pop("camera", {})
+    measures = parse_config({"robot": own, "camera": camera}, f"robot.file {path}").robot
+    defaults = {"robot": measures.model_dump(mode="json"), "camera": camera}
+    return with_defaults({**values, "robot": {**robot, "file": path.name}}, defaults)
+
+
+def _robots_first(overrides: Overrides, values: dict[str, object]) -> Overrides:
+    """Return overrides with the choice of a robot before its measures.
+
+    Another robot than that of a stored configuration, which has all measures, has its own ones.
+    """
+    chosen = [x for x in overrides if _key_of(x) in ("robot.preset", "robot.file")]
+    robot = values.get("robot")
+    if chosen and isinstance(robot, dict) and RobotConfig.model_fields.keys() <= robot.keys():
+        del values["robot"]
+    others = [x for x in overrides if x not in chosen]
+    if isinstance(overrides, Mapping):
+        return {key: overrides[key] for key in (*chosen, *others)}
+    return [*chosen, *others]
+
+
+def _key_of(override: object) -> str:
+    """Return the key of an override in Python or after `--set`."""
+    return str(override).partition("=")[0].strip()
+
+
+def _find_robot_beside(config: Path, values: dict[str, object]) -> None:
+    """Set the robot's file to the one beside a configuration file, or stored in its run."""
+    robot = values.get("robot")
+    if isinstance(robot, dict) and isinstance(name := robot.get("file"), str):
+        for folder in (config.parent, config.parent / FOLDER):
+            if (folder / name).is_file():
+                robot["file"] = str(folder / name)
+                return
 
 
 def parse_config(values: Mapping[str, object], source: str = "config") -> Config:
@@ -85,7 +143,7 @@ def parse_config(values: Mapping[str, object], source: str = "config") -> Config
       ConfigError: as for `load_config`.
     """
     try:
-        return Config.model_validate(values)
+        return Config.model_validate(_with_robot_of_file(values))
     except ValidationError as error:
         # Only a mistake needs it.
         from jetbot_mjx.config.explain import explain

@@ -9,7 +9,7 @@ and everything else follows from it:
 - the values at which `evaluate --robustness` evaluates a policy,
 - its rows in the tables of the documentation, of which the meaning is the field's docstring.
 
-Sources, by tag; BOM, EST and SIM are those of `envs/robot_model.py`:
+Sources, by tag; BOM, EST and SIM are those of `assets/robots/isaac.yaml`:
   CAD         the space for the battery and the clearance of the casters in the CAD model
   CSE276A     gassajor000/cse276a_jetbot: calibration of a JetBot's motors
   DUCKIETOWN  gym-duckietown: simulator of a robot with the same motors

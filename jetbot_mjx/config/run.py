@@ -4,7 +4,7 @@ import io
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self, TypeAlias
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 from ruamel.yaml import YAML
 
 from jetbot_mjx.config.camera import CameraConfig
@@ -14,6 +14,7 @@ from jetbot_mjx.config.physics import PhysicsConfig
 from jetbot_mjx.config.ppo import PPOConfig
 from jetbot_mjx.config.randomization import RandomizationConfig
 from jetbot_mjx.config.robot import RobotConfig
+from jetbot_mjx.config.robot_mjcf import MjcfRobotConfig, is_model
 from jetbot_mjx.config.section import Section
 from jetbot_mjx.config.task import TaskConfig
 from jetbot_mjx.config.value_types import Count, Steps, integral, wandb_project
@@ -25,10 +26,14 @@ BRAX_DEFAULTS: Mapping[str, object] = {
 """Defaults of settings under `trainer: brax` that differ from the others."""
 
 
-Setting = bool | int | float | str | list["Setting"] | None
+Setting = bool | int | float | str | list["Setting"] | dict[str, "Setting"] | None
 """Value of a setting, as JSON."""
 
 _Nested: TypeAlias = "Mapping[str, Setting | _Nested]"
+
+
+ROBOT_KINDS = "measures", "model"
+"""What the section `robot` may hold; pydantic adds these words to the places of errors."""
 
 
 class Config(Section):
@@ -63,7 +68,11 @@ class Config(Section):
     """Whether to write TensorBoard's event files beside `metrics.jsonl`."""
     wandb: Annotated[str, BeforeValidator(wandb_project)] | None = None
     """Project of Weights & Biases that the run is also logged to; null: none."""
-    robot: RobotConfig = RobotConfig()
+    robot: Annotated[
+        Annotated[RobotConfig, Tag(ROBOT_KINDS[0])]
+        | Annotated[MjcfRobotConfig, Tag(ROBOT_KINDS[1])],
+        Discriminator(lambda values: ROBOT_KINDS[is_model(values)]),
+    ] = RobotConfig()
     task: TaskConfig = TaskConfig()
     camera: CameraConfig = CameraConfig()
     physics: PhysicsConfig = PhysicsConfig()
@@ -76,7 +85,7 @@ class Config(Section):
     def _defaults_for_brax(cls, values: object) -> object:
         """Default to what Brax's own trainer knows, where it is to train."""
         if isinstance(values, Mapping) and values.get("trainer") == "brax":
-            return _with_defaults(values, BRAX_DEFAULTS)
+            return with_defaults(values, BRAX_DEFAULTS)
         return values
 
     @model_validator(mode="after")
@@ -93,6 +102,8 @@ class Config(Section):
                 f" changes an image, and task.observation = {self.task.observation!r} sees none:"
                 " set task.observation: camera, or leave it out"
             )
+        if isinstance(self.robot, MjcfRobotConfig):
+            self.robot.check_drawn(self.randomization.drawn)
         if self.task.sees and self.init_from is not None:
             raise ValueError(
                 f"init_from = {shown(self.init_from)}: a policy with task.observation ="
@@ -224,15 +235,20 @@ CHANGEABLE_ON_RESUME = (
 """Settings that may change on resume: the length of the training, and what it writes."""
 
 
-def _with_defaults(
+def with_defaults(
     values: Mapping[str, object], defaults: Mapping[str, object]
 ) -> dict[str, object]:
-    """Return nested settings with those that are missing taken from others."""
+    """Return nested settings with those that are missing taken from others.
+
+    Args:
+      values: the settings.
+      defaults: the others, nested alike.
+    """
     merged = {**defaults, **values}
     for key, default in defaults.items():
         given = values.get(key)
         if isinstance(default, Mapping) and isinstance(given, Mapping):
-            merged[key] = _with_defaults(given, default)
+            merged[key] = with_defaults(given, default)
     return merged
 
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from jetbot_mjx.config import PhysicsConfig
+from jetbot_mjx.config import PhysicsConfig, RobotConfig
 from jetbot_mjx.deployment.simulated_camera import camera_config
-from jetbot_mjx.envs import GOAL_HEIGHT, QPOS_QUAT, QPOS_XYZ, REAL, Camera, make_mj_model, turned
+from jetbot_mjx.envs import GOAL_HEIGHT, QPOS_QUAT, QPOS_XYZ, Camera, make_mj_model, turned
 from jetbot_mjx.runs import JsonObject
 
 SHOWN = 8
@@ -74,7 +74,7 @@ def picture_strip(
 def _simulated_images(
     image: JsonObject, poses: Float[np.ndarray, "n 3"], goal: Sequence[float]
 ) -> UInt8[np.ndarray, "n h w 3"]:
-    model = make_mj_model(REAL, PhysicsConfig())
+    model = make_mj_model(RobotConfig(preset="real"), PhysicsConfig())
     size = {"width": image["width"], "height": image["height"]}
     camera = Camera(camera_config(image).model_copy(update=size), model)
     rest = jnp.asarray(model.qpos0, jnp.float32)

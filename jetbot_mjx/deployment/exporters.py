@@ -18,7 +18,13 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from jetbot_mjx.deployment.numpy_policy import Encoder, Layer, Outputs, PortablePolicy
+from jetbot_mjx.deployment.numpy_policy import (
+    Encoder,
+    Layer,
+    Outputs,
+    OwnController,
+    PortablePolicy,
+)
 
 if TYPE_CHECKING:
     import onnx
@@ -162,11 +168,11 @@ def _write_onnx(policy: PortablePolicy, _: Act, path: Path) -> None:
     if policy.squash:
         x = node("Tanh", x, out="squashed")
     node("Clip", x, constant("low", -1.0), constant("high", 1.0), out="action")
-    # Append the controller, which is linear in the action.
-    drive = 0.5 * policy.controller.max_speed / policy.controller.wheel_radius
-    turn = policy.controller.fastest - 2.0 * drive
-    mixing = constant("mixing", [[drive, drive], [-turn, turn]])
-    node("Gemm", "action", mixing, constant("half_speed", [drive, drive]), out="wheel_speeds")
+    # Append the controller, which is linear in the action; half speed is a drive of 0.
+    rows = policy.controller.mixing
+    half = 0.0 if isinstance(policy.controller, OwnController) else 1.0
+    offset = constant("half_speed", half * np.asarray(rows[0]))
+    node("Gemm", "action", constant("mixing", rows), offset, out="wheel_speeds")
 
     def tensor(name: str, shape: Sequence[int], dtype: DTypeLike) -> "onnx.ValueInfoProto":
         kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
@@ -178,7 +184,7 @@ def _write_onnx(policy: PortablePolicy, _: Act, path: Path) -> None:
             graph.nodes,
             "policy",
             [tensor(name, x.shape, x.dtype) for name, x in policy.inputs.items()],
-            [tensor(name, [2], np.float32) for name in _OUTPUTS],
+            [tensor(name, [len(rows)], np.float32) for name in _OUTPUTS],
             graph.constants,
         ),
         opset_imports=[helper.make_opsetid("", _ONNX_OPSET)],

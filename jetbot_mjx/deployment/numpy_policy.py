@@ -30,7 +30,7 @@ TOLERANCE = 1e-5
 _PARTS = {"image": PIXELS, "state": NUMBERS}
 """Inputs of a policy that sees, and their keys in the environment's observation."""
 
-Outputs = tuple[Float[Array | np.ndarray, "n 2"], Float[Array | np.ndarray, "n 2"]]
+Outputs = tuple[Float[Array | np.ndarray, "n action"], Float[Array | np.ndarray, "n _"]]
 """Actions in [-1, 1], and the wheel speeds (left, right) [rad/s] that they command."""
 
 
@@ -51,6 +51,53 @@ class Controller(NamedTuple):
         """Return the largest wheel speed that an action can command [rad/s]."""
         turn = 0.5 * self.max_yaw_rate * self.wheel_separation
         return (self.max_speed + turn) / self.wheel_radius
+
+    @property
+    def mixing(self) -> list[list[float]]:
+        """Return the derivative of the wheel speeds (left, right) by drive and turn [rad/s]."""
+        drive = 0.5 * self.max_speed / self.wheel_radius
+        turn = self.fastest - 2.0 * drive
+        return [[drive, drive], [-turn, turn]]
+
+
+class CarController(NamedTuple):
+    """The controller that converts an action to a wheel speed and a curvature of the path."""
+
+    max_speed: float
+    """Speed of the middle of the rear axle of a₀ = 1 [m/s]."""
+    max_curvature: float
+    """Curvature of a₁ = 1 [1/m]."""
+    wheel_radius: float
+    """Radius of the driven wheels [m]."""
+
+    @property
+    def fastest(self) -> float:
+        """Return the largest wheel speed that an action can command [rad/s]."""
+        return self.max_speed / self.wheel_radius
+
+    @property
+    def mixing(self) -> list[list[float]]:
+        """Return the derivative of wheel speed [rad/s] and curvature [1/m] by drive and turn."""
+        return [[0.5 * self.fastest, 0.0], [0.0, self.max_curvature]]
+
+
+class OwnController(NamedTuple):
+    """A controller that only the robot's own function knows: the action as it is."""
+
+    action_size: int
+
+    @property
+    def fastest(self) -> float:
+        """Return the largest number of an action."""
+        return 1.0
+
+    @property
+    def mixing(self) -> list[list[float]]:
+        """Return the derivative of the action by itself."""
+        return np.eye(self.action_size).tolist()
+
+
+AnyController = Controller | CarController | OwnController
 
 
 class Layer(NamedTuple):
@@ -94,7 +141,7 @@ class PortablePolicy(NamedTuple):
     """Activation between the layers."""
     squash: bool
     """Whether tanh follows the last layer; the clip to [-1, 1] follows in any case."""
-    controller: Controller
+    controller: AnyController
 
     @property
     def inputs(self) -> dict[str, jax.ShapeDtypeStruct]:
@@ -111,16 +158,18 @@ class Recording(NamedTuple):
 
     inputs: Mapping[str, np.ndarray]
     """Inputs of the policy by their names, in their order, each with a batch axis."""
-    action: Float[np.ndarray, "n 2"]
-    wheel_speeds: Float[np.ndarray, "n 2"]
-    """(left, right) [rad/s]."""
+    action: Float[np.ndarray, "n action"]
+    wheel_speeds: Float[np.ndarray, "n _"]
+    """(left, right) [rad/s]; of a car (wheel speed [rad/s], curvature [1/m]); the action itself
+    where only the robot's own function knows what it means."""
 
 
-def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
+def portable_policy(checkpoint: Checkpoint, env: JetBotEnv) -> PortablePolicy:
     """Extract a policy from a checkpoint.
 
     Args:
       checkpoint: A checkpoint of a network that `make_networks` built.
+      env: The environment that the policy was trained in.
 
     Returns:
       The policy as arrays. Compare its outputs with `as_jax`, which uses Brax's own code.
@@ -151,12 +200,17 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
         layers=tuple(layers),
         activation=network.activation,
         squash=network.distribution_type == "tanh_normal",
-        controller=Controller(
-            max_speed=config.task.max_speed,
-            max_yaw_rate=config.task.max_yaw_rate,
-            wheel_radius=envs.CONTROLLER_WHEEL_RADIUS,
-            wheel_separation=envs.CONTROLLER_WHEEL_SEPARATION,
-        ),
+        controller=_controller(env.drive),
+    )
+
+
+def _controller(drive: envs.Drive) -> AnyController:
+    if isinstance(drive, envs.OwnDrive):
+        return OwnController(drive.action_size)
+    if isinstance(drive, envs.AckermannDrive):
+        return CarController(drive.max_speed, drive.max_curvature, drive.wheel_radius)
+    return Controller(
+        drive.max_speed, drive.max_yaw_rate, drive.wheel_radius, drive.wheel_separation
     )
 
 
@@ -260,7 +314,7 @@ def _inputs(obs: Observation) -> dict[str, np.ndarray]:
     return {name: obs[key] for name, key in _PARTS.items() if key in obs}
 
 
-def difference(recording: Recording, outputs: Outputs, controller: Controller) -> float:
+def difference(recording: Recording, outputs: Outputs, controller: AnyController) -> float:
     """Return the largest difference of another implementation's results from JAX's.
 
     Args:

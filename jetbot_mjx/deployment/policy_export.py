@@ -69,7 +69,7 @@ def export_policy(
     checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
     folder = checkpoint.run_dir / FOLDER if output is None else Path(output)
     env = checkpoint.make_env()
-    policy, reference = portable_policy(checkpoint), as_jax(checkpoint, env)
+    policy, reference = portable_policy(checkpoint, env), as_jax(checkpoint, env)
     with runs.writing_to(folder):
         if folder.exists() and not (folder / FILE).is_file():
             raise UserError(

@@ -6,11 +6,39 @@ from pathlib import Path
 import numpy as np
 
 from jetbot_mjx.config import CameraConfig
-from jetbot_mjx.deployment.numpy_policy import Encoder, PortablePolicy
-from jetbot_mjx.envs import GOAL_HEIGHT, QPOS_QUAT, QPOS_XYZ, JetBotEnv, Layout, intrinsics
+from jetbot_mjx.deployment.numpy_policy import (
+    CarController,
+    Encoder,
+    OwnController,
+    PortablePolicy,
+)
+from jetbot_mjx.envs import (
+    GOAL_HEIGHT,
+    QPOS_QUAT,
+    QPOS_XYZ,
+    AckermannDrive,
+    DifferentialDrive,
+    JetBotEnv,
+    Layout,
+    intrinsics,
+)
 from jetbot_mjx.runs import Checkpoint, JsonObject, read_text, versions
 
 FILE = "policy.json"
+
+_WHEELS_OF_CARS = {
+    "order": ["wheel_speed", "curvature"],
+    "unit": ["rad/s", "1/m"],
+    "formula": [
+        "v = (drive + 1)/2 * max_speed",
+        "wheel_speed = v / wheel_radius",
+        "curvature = turn * max_curvature",
+        "angle of a wheel x ahead of the rear axle, y to the left = atan(x * curvature / (1 - y *"
+        " curvature))",
+        "its speed = wheel_speed * sqrt((1 - y * curvature)^2 + (x * curvature)^2)",
+    ],
+}
+"""What a car's wheels are told, in place of the speeds of two sides."""
 
 _TEMPLATE = Path(__file__).parents[1] / "assets" / "policy_spec.json"
 """The keys in their order, and the values that are the same for every policy."""
@@ -43,13 +71,12 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
     if policy.mean.size:
         spec["inside"].insert(-3, "normaliser")
     # Fill in what differs between policies; the limit of wheel speeds is in rad/s.
-    spec["wheel_speeds"] |= policy.controller._asdict()
-    spec["wheel_speeds"]["limit_in_training"] = env.robot.max_wheel_speed
+    _describe_drive(spec, policy, env)
     return spec | {
         "run": checkpoint.run_dir.name,
         "env_steps": checkpoint.env_steps,
         "task": config.task.name,
-        "robot": config.robot.preset,
+        "robot": config.robot.model_dump(mode="json"),
         "control_rate": 1.0 / env.dt,
         "control_period": env.dt,
         "inputs": [
@@ -71,6 +98,42 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
         "evaluation": _evaluation(checkpoint),
         "versions": versions(),
     }
+
+
+def _describe_drive(spec: JsonObject, policy: PortablePolicy, env: JetBotEnv) -> None:
+    """Add what the action means, and of a robot's own model which actuator does what."""
+    if isinstance(policy.controller, CarController):
+        spec["wheel_speeds"] |= _WHEELS_OF_CARS
+    if isinstance(policy.controller, OwnController):
+        spec["action"] = [
+            {"name": f"action_{i}", "index": i, "unit": "1", "low": -1.0, "high": 1.0}
+            for i in range(policy.controller.action_size)
+        ]
+        spec["wheel_speeds"] = {"order": [one["name"] for one in spec["action"]], "unit": "1"}
+    spec["wheel_speeds"] |= policy.controller._asdict()
+    spec["wheel_speeds"]["limit_in_training"] = env.robot.max_wheel_speed
+    if actuators := _actuators(env):
+        spec["actuators"] = actuators
+
+
+def _actuators(env: JetBotEnv) -> list[JsonObject]:
+    """Return which wheel each actuator of a robot's own model has; none of a JetBot."""
+    drive, wheels = env.drive, []
+    if isinstance(drive, AckermannDrive):
+        wheels = [*(("angle", one) for one in drive.steered), *(("speed", x) for x in drive.driven)]
+    elif isinstance(drive, DifferentialDrive):
+        wheels = [("speed", one) for one in drive.wheels]
+    return [
+        {
+            "name": env.mj_model.actuator(one.actuator).name.rpartition("/")[2],
+            "index": one.actuator,
+            "control": what,
+            "gain": one.gain,
+            "x": one.x,
+            "y": one.y,
+        }
+        for what, one in wheels
+    ]
 
 
 def _sizes(encoder: Encoder) -> JsonObject:

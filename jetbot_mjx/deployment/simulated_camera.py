@@ -10,9 +10,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from jetbot_mjx.config import CameraConfig, PhysicsConfig
+from jetbot_mjx.config import CameraConfig, PhysicsConfig, RobotConfig
 from jetbot_mjx.deployment.simulated_jetbot import SimulatedJetBot
-from jetbot_mjx.envs import GOAL_HEIGHT, REAL, MujocoCamera, SceneryKind, make_mj_model
+from jetbot_mjx.envs import GOAL_HEIGHT, MujocoCamera, SceneryKind, make_mj_model
 from jetbot_mjx.runs import JsonObject
 
 SIDE = 224
@@ -80,7 +80,7 @@ class SimulatedCamera:
           UserError: this machine has no OpenGL.
         """
         self.model = CameraModel() if model is None else model
-        scene = make_mj_model(REAL, PhysicsConfig())
+        scene = make_mj_model(RobotConfig(preset="real"), PhysicsConfig())
         self._camera = MujocoCamera(config, scene, appearance=appearance)
         self._robot, self._rng = robot, np.random.default_rng(0)
         robot.watchers.append(self._look)

@@ -10,7 +10,6 @@ and a lag:
 """
 
 import collections
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -19,8 +18,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from jetbot_mjx.config import PhysicsConfig
-from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ, REAL, make_mj_model
+from jetbot_mjx.config import PhysicsConfig, RobotConfig
+from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ, make_mj_model
 
 ROLLING_RADIUS = 0.0321
 """Distance over the floor per radian of a wheel [m]: under load it sinks 0.4 mm into the floor."""
@@ -63,7 +62,7 @@ class SimulatedJetBot:
         """
         self.motor_model = MotorModel() if motors is None else motors
         # The motor model limits the wheel speed instead of the preset.
-        robot = dataclasses.replace(REAL, max_wheel_speed=None)
+        robot = RobotConfig(preset="real", max_wheel_speed=None)
         self._model = make_mj_model(robot, PhysicsConfig(), visual=False)
         self._data = mujoco.MjData(self._model)
         self._time = 0.0

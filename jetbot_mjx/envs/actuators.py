@@ -15,33 +15,36 @@ from jetbot_mjx.config import RobotParams
 class ActuatorState(NamedTuple):
     """An `ActuatorState` holds what the actuator model carries from step to step."""
 
-    commands: Float[Array, "delay 2"] | None
+    commands: Float[Array, "delay command"] | None
     """The last commands [rad/s], the newest first; None: the model has no delay."""
     targets: Float[Array, "2"] | None
     """Output of the motor lag in the last step [rad/s]; None: the model has no lag."""
 
 
-def initial_actuator_state(robot_params: RobotParams, longest_delay: int) -> ActuatorState:
+def initial_actuator_state(
+    robot_params: RobotParams, longest_delay: int, size: int = 2
+) -> ActuatorState:
     """Return the actuator state before the first command: the motors stand still.
 
     Args:
       robot_params: the parameters of the robot.
       longest_delay: the longest `action_delay` that the compiled program supports [control steps].
+      size: the length of a command; the motors of two sides have two numbers.
     """
     return ActuatorState(
-        jnp.zeros((longest_delay, 2)) if longest_delay else None,
+        jnp.zeros((longest_delay, size)) if longest_delay else None,
         jnp.zeros(2) if robot_params.differs("motor_lag") else None,
     )
 
 
 def step_actuators(
     actuators: ActuatorState,
-    command: Float[Array, "2"],
+    command: Float[Array, " command"],
     robot_params: RobotParams,
     *,
     full_speed: float,
     ctrl_dt: float,
-) -> tuple[ActuatorState, Float[Array, "2"]]:
+) -> tuple[ActuatorState, Float[Array, " command"]]:
     """Return the wheel speed targets of this step for one command.
 
         u = voltage · command of `action_delay` steps ago
@@ -60,7 +63,8 @@ def step_actuators(
 
     Args:
       actuators: the state before the step.
-      command: wheel speeds (left, right) [rad/s], within the limits of the motors.
+      command: wheel speeds (left, right) [rad/s], within the limits of the motors; of a robot
+        without two sides, a command of which only the delay changes.
       robot_params: the parameters of the robot.
       full_speed: the speed of a motor at full voltage [rad/s].
       ctrl_dt: the duration of a control step [s].
@@ -89,7 +93,9 @@ def step_actuators(
     return ActuatorState(commands, targets), _at_preset_wheels(command, robot_params)
 
 
-def _at_preset_wheels(target: Float[Array, "2"], robot_params: RobotParams) -> Float[Array, "2"]:
+def _at_preset_wheels(
+    target: Float[Array, " command"], robot_params: RobotParams
+) -> Float[Array, " command"]:
     """Return the speeds at which the preset's wheels move like this robot's wheels at `target`."""
     sides = jnp.array([0.5, -0.5])
     if robot_params.differs("motor_gain", "wheel_radius"):

@@ -14,16 +14,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx.config import QUANTITIES, LookParams, RandomizationConfig, RobotParams
+from jetbot_mjx.config import (
+    QUANTITIES,
+    LookParams,
+    MjcfRobotConfig,
+    RandomizationConfig,
+    RobotParams,
+)
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.actuators import ActuatorState, initial_actuator_state, step_actuators
 from jetbot_mjx.envs.camera.scene import GOAL
 from jetbot_mjx.envs.camera.surroundings import draw_surroundings
 from jetbot_mjx.envs.camera.timing import CameraState, initial_camera_state, step_camera
 from jetbot_mjx.envs.camera.wrapper import seen_pose
+from jetbot_mjx.envs.drive import OwnDrive
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, QPOS_QUAT, QPOS_XYZ
-from jetbot_mjx.envs.robot_params import vary_model
+from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
+from jetbot_mjx.envs.robot_params import vary_model, vary_own_model
 from jetbot_mjx.envs.sensors import SensorState, add_offsets, initial_sensor_state, step_sensors
 from jetbot_mjx.envs.state import PhysicsState, State, robot_state
 from jetbot_mjx.errors import InvalidError
@@ -106,7 +113,9 @@ class DomainRandomizationWrapper(Wrapper):
         """
         super().__init__(env.blind())
         self.camera = env.camera
-        self._constant = robot_params or RobotParams()
+        # A car has no motors on two sides: what differs in them is left out.
+        kept = {name: getattr(robot_params or RobotParams(), name) for name in env.robot.quantities}
+        self._constant = RobotParams()._replace(**kept)
         self._constant_looks = look_params or LookParams()
         self._ranges = ranges or RandomizationConfig()
         looks = self._ranges.looks
@@ -120,7 +129,9 @@ class DomainRandomizationWrapper(Wrapper):
         self._largest = {name: self._largest_value(name) for name in LARGEST_TRACED}
         limit = env.robot.max_wheel_speed
         self._limit = math.inf if limit is None else limit
-        self._full_speed = limit or env.config.task.max_speed / CONTROLLER_WHEEL_RADIUS
+        self._full_speed = math.inf
+        if not isinstance(env.drive, OwnDrive):
+            self._full_speed = limit or env.drive.max_speed / env.drive.wheel_radius
 
     def _largest_value(self, name: str) -> int:
         """Return the largest value of a whole number that the program must support."""
@@ -172,7 +183,8 @@ class DomainRandomizationWrapper(Wrapper):
         noise_key = jax.random.fold_in(rng, _KEY_SALT + 1)
         longest = self._largest["observation_delay"]
         sensors = initial_sensor_state(robot, noise_key, robot_params, longest)
-        motors = initial_actuator_state(robot_params, self._largest["action_delay"])
+        size = self.env.action_size
+        motors = initial_actuator_state(robot_params, self._largest["action_delay"], size)
         state = state.replace(
             pipeline_state=physics,
             obs=self.env.observe(add_offsets(robot, robot_params), state.goal),
@@ -180,7 +192,7 @@ class DomainRandomizationWrapper(Wrapper):
         camera = self._begin_camera(state, drawn, rng)
         return state.replace(episode_params=EpisodeParams(drawn, motors, sensors, camera))
 
-    def step(self, state: State, action: Float[Array, "2"]) -> State:
+    def step(self, state: State, action: Float[Array, " action"]) -> State:
         """Make one environment step through actuator model, physics and sensor model.
 
         Args:
@@ -191,10 +203,12 @@ class DomainRandomizationWrapper(Wrapper):
         robot_params = self._with_drawn(self._constant, drawn)
         # The limit is electronic: it applies before the motor lag.
         command = jnp.clip(self.env.wheel_targets(action), -self._limit, self._limit)
-        motors, ctrl = step_actuators(
+        motors, command = step_actuators(
             motors, command, robot_params, full_speed=self._full_speed, ctrl_dt=self.env.dt
         )
-        state = self._env_of(robot_params).step_with_ctrl(state, action, ctrl)
+        state = self._env_of(robot_params).step_with_ctrl(
+            state, action, self.env.drive.controls(command)
+        )
         robot = robot_state(state.pipeline_state)
         count = jnp.round(state.pipeline_state.time / self.env.dt).astype(jnp.int32)
         sensors, measured = step_sensors(sensors, robot, robot_params, count)
@@ -213,7 +227,10 @@ class DomainRandomizationWrapper(Wrapper):
             open_range = np.full(model.actuator_ctrlrange.shape, (-_UNLIMITED, _UNLIMITED))
             model = model.replace(actuator_ctrlrange=open_range.astype(np.float32))
         if robot_params.differs(*_MODEL):
-            model = vary_model(model, self.env.mj_model, robot_params)
+            if isinstance(self.env.robot, MjcfRobotConfig):
+                model = vary_own_model(model, robot_params)
+            else:
+                model = vary_model(model, self.env.mj_model, robot_params)
         return self.env if model is self.env.mjx_model else self.env.with_model(model)
 
 

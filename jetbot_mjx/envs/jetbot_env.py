@@ -17,11 +17,14 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt32
 
-from jetbot_mjx.config import Config, Overrides, load_config
+from jetbot_mjx.config import Config, MjcfRobotConfig, Overrides, load_config
 from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, numbers_of, observation_shapes, see
+from jetbot_mjx.envs.drive import Drive, jetbot_drive
+from jetbot_mjx.envs.mjcf_robot import RobotFileError, find_drive
 from jetbot_mjx.envs.physics import Physics
+from jetbot_mjx.envs.robot_trial import drive_trial
 from jetbot_mjx.envs.state import Obs, PhysicsState, State, robot_state
 from jetbot_mjx.envs.task import (
     AdvancesGoal,
@@ -82,17 +85,22 @@ class JetBotEnv(Env):
         """
         self.config = config
         self.task: Task = make_task(config.task, task_class)
-        self.robot = robot_model.ROBOTS[config.robot.preset]
+        self.robot = config.robot
         make_model = functools.partial(
             robot_model.make_mj_model, self.robot, config.physics, build_scene=self.task.build_scene
         )
         try:
             self.mj_model: mujoco.MjModel = make_model()
             self.physics = Physics(make_model(visual=False), config.physics)
-            self.camera = Camera(config.camera, self.mj_model) if config.task.sees else None
+            self.drive: Drive = _drive(config, self.physics.mj_model)
+            self.camera = None
+            if config.task.sees:
+                body = robot_model.robot_body(self.mj_model)
+                self.camera = Camera(config.camera, self.mj_model, body)
             # MJX may not support a custom scene: build its model now, to fail before a run begins.
             # The model of a built-in task is built later, when a program is compiled.
-            if type(self.task).build_scene is not GoalTask.build_scene:
+            own = isinstance(self.robot, MjcfRobotConfig)
+            if own or type(self.task).build_scene is not GoalTask.build_scene:
                 _ = self.physics.model
         except UserError:
             raise
@@ -100,6 +108,8 @@ class JetBotEnv(Env):
             reason = " ".join(str(error).split())
             if isinstance(error, NotImplementedError):
                 reason = f"MJX does not support {reason}"
+            if isinstance(self.robot, MjcfRobotConfig):
+                raise RobotFileError(self.robot, reason) from None
             raise UserError(
                 f"task.name = {config.task.name!r}: its scene cannot be simulated: {reason}"
                 f" (jetbot-mjx check-env {config.task.name} says more)"
@@ -109,7 +119,7 @@ class JetBotEnv(Env):
         """Return the task, the robot and the sizes in one line."""
         task = self.config.task
         return (
-            f"{type(self).__name__}(task={task.name!r}, robot={self.config.robot.preset!r},"
+            f"{type(self).__name__}(task={task.name!r}, robot={self.robot.label!r},"
             f" observation={task.observation!r}, observation_size={self.observation_size},"
             f" action_size={self.action_size})"
         )
@@ -194,7 +204,7 @@ class JetBotEnv(Env):
         )
         return state if self.camera is None else see(self.camera, self.task, state)
 
-    def step(self, state: State, action: Float[Array, "2"]) -> State:
+    def step(self, state: State, action: Float[Array, " action"]) -> State:
         """Make one environment step.
 
         Args:
@@ -209,22 +219,23 @@ class JetBotEnv(Env):
         """
         _check_one("action", action, (self.action_size,), "step")
         _check_one("state.done", state.done, (), "step")
-        targets = self.wheel_targets(action)
+        ctrl = self.drive.controls(self.wheel_targets(action))
         if self.camera is None:
-            return self.step_with_ctrl(state, action, targets)
+            return self.step_with_ctrl(state, action, ctrl)
         before = state.replace(obs=numbers_of(state.obs))
-        nstate = self.step_with_ctrl(before, action, targets)
+        nstate = self.step_with_ctrl(before, action, ctrl)
         return see(self.camera, self.task, nstate, state.obs[PIXELS], begins=False)
 
     def step_with_ctrl(
-        self, state: State, action: Float[Array, "2"], ctrl: Float[Array, "2"]
+        self, state: State, action: Float[Array, " action"], ctrl: Float[Array, " nu"]
     ) -> State:
         """Make one environment step with given wheel speed targets, without the camera.
 
         Args:
           state: a state of this environment, whose observation has no images.
           action: the action, in [-1, 1]²; only the task's reward uses it.
-          ctrl: wheel speed targets (left, right) [rad/s], constant during the step.
+          ctrl: controls of the actuators, constant during the step; of a JetBot the wheel speed
+            targets (left, right) [rad/s].
 
         Returns:
           The next state, with the same tree structure, shapes and dtypes.
@@ -245,7 +256,7 @@ class JetBotEnv(Env):
         )
 
     def task_step(
-        self, before: RobotState, after: RobotState, goal: Goal, action: Float[Array, "2"]
+        self, before: RobotState, after: RobotState, goal: Goal, action: Float[Array, " action"]
     ) -> TaskStep:
         """Compute the task's results for one step of the robot.
 
@@ -298,23 +309,33 @@ class JetBotEnv(Env):
             )
         return jnp.stack([markers[name] for name in names])
 
-    def wheel_targets(self, action: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Return the wheel speeds that an action commands, before motor limits.
+    def wheel_targets(self, action: Float[Array, " action"]) -> Float[Array, " command"]:
+        """Return what an action commands, before motor limits.
 
         Args:
           action: the action; values outside [-1, 1] are clipped.
 
         Returns:
-          Wheel speed targets (left, right) [rad/s].
+          Wheel speed targets (left, right) [rad/s]; of a car a wheel speed [rad/s] and a curvature
+          [1/m]; of a drive that is a function the action itself. `drive.controls` makes the
+          controls of the actuators of it.
         """
-        twist_b = kinematics.twist_from_action(
-            action, max_speed=self.config.task.max_speed, max_yaw_rate=self.config.task.max_yaw_rate
+        return self.drive.command(action)
+
+    def action_of_twist(self, twist_b: Float[Array, "2"]) -> Float[Array, " action"]:
+        """Return the action that commands a speed and a yaw rate to a JetBot.
+
+        Args:
+          twist_b: (v, ω), forward speed [m/s] and yaw rate [rad/s].
+
+        Returns:
+          The action. Of another length than two, it is cut off, or the other numbers are 0.
+        """
+        task, size = self.config.task, self.action_size
+        action = kinematics.action_from_twist(
+            twist_b, max_speed=task.max_speed, max_yaw_rate=task.max_yaw_rate
         )
-        return kinematics.wheel_speeds(
-            twist_b,
-            wheel_radius=robot_model.CONTROLLER_WHEEL_RADIUS,
-            wheel_separation=robot_model.CONTROLLER_WHEEL_SEPARATION,
-        )
+        return action if size == 2 else jnp.pad(action, (0, max(size - 2, 0)))[:size]
 
     @property
     def observation_size(self) -> int | dict[str, tuple[int, ...]]:
@@ -338,8 +359,8 @@ class JetBotEnv(Env):
 
     @property
     def action_size(self) -> int:
-        """Length of the action: drive and turn."""
-        return 2
+        """Length of the action: drive and turn, unless the robot's drive is a function."""
+        return self.drive.action_size
 
     @property
     def backend(self) -> str:
@@ -350,6 +371,15 @@ class JetBotEnv(Env):
     def dt(self) -> float:
         """Duration of one environment step [s]."""
         return self.config.physics.ctrl_dt
+
+
+def _drive(config: Config, model: mujoco.MjModel) -> Drive:
+    """Return the drive of a configuration's robot; one that is a model of its own must drive."""
+    if not isinstance(config.robot, MjcfRobotConfig):
+        return jetbot_drive(config)
+    drive = find_drive(config.robot, config.task, model)
+    drive_trial(config, model, drive)
+    return drive
 
 
 def _check_one(name: str, array: object, shape: tuple[int, ...], method: str) -> None:

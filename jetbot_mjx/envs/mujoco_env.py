@@ -7,6 +7,7 @@ observation, images, reward, termination) is the code of `JetBotEnv`, compiled b
 import copy
 import functools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -15,11 +16,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt8, UInt32
 
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, RobotConfig
 from jetbot_mjx.devices import default_device_cpu
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, see
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
-from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
 from jetbot_mjx.envs.state import Obs, PhysicsState, State, robot_state
 from jetbot_mjx.envs.task import AdvancesGoal, Goal, TaskClass, layout_size
 
@@ -68,7 +68,7 @@ class MujocoJetBot:
         self.data = mujoco.MjData(self.model)
         self.goal: Goal = None
         """Goal of this episode, as it stands now."""
-        self._task = config.task
+        self._task, self._robot = config.task, config.robot
         self._n_substeps = config.physics.n_substeps
         self._goal_advances = isinstance(self.env.task, AdvancesGoal)
         # Views of MuJoCo's arrays.
@@ -101,7 +101,7 @@ class MujocoJetBot:
         numbers = {NUMBERS: self._numbers.copy()} if self._numbers.size else {}
         return {PIXELS: np.array(self._images), **numbers}
 
-    def step(self, action: Float[np.ndarray, "2"]) -> Step:
+    def step(self, action: Float[np.ndarray, " action"]) -> Step:
         """Make one environment step.
 
         Args:
@@ -133,19 +133,30 @@ class MujocoJetBot:
                 self.data.mocap_pos[:] = self._mocap_pos
         return Step(self._observation(), reward, terminated > 0, success > 0, True)
 
-    def wheel_targets(self, action: Float[np.ndarray, "2"]) -> tuple[float, float]:
-        """Return the wheel speeds (left, right) [rad/s] of an action, before motor limits.
+    def wheel_targets(self, action: Float[np.ndarray, " action"]) -> Sequence[float]:
+        """Return the controls of an action, before motor limits.
 
-        This is `JetBotEnv.wheel_targets` in Python, since a call of JAX takes as long as physics.
+        Those of a JetBot are computed in Python, since a call of JAX takes as long as physics.
 
         Args:
           action: the action; values outside [-1, 1] are clipped.
         """
+        if not isinstance(self._robot, RobotConfig):
+            return np.asarray(self._controls(np.asarray(action, np.float32))).tolist()
         # These comparisons keep NaN, as `jnp.clip` does.
         drive, turn = (-1.0 if x < -1.0 else 1.0 if x > 1.0 else x for x in action.tolist())
         speed = 0.5 * (drive + 1.0) * self._task.max_speed
-        half = 0.5 * turn * self._task.max_yaw_rate * CONTROLLER_WHEEL_SEPARATION
-        return (speed - half) / CONTROLLER_WHEEL_RADIUS, (speed + half) / CONTROLLER_WHEEL_RADIUS
+        half = 0.5 * turn * self._task.max_yaw_rate * self._robot.controller_wheel_separation
+        radius = self._robot.controller_wheel_radius
+        return (speed - half) / radius, (speed + half) / radius
+
+    @functools.cached_property
+    def _controls(self) -> jax.stages.Compiled:
+        """Return the program from an action to the controls of a robot's own model."""
+        drive = self.env.drive
+        with default_device_cpu():
+            program = jax.jit(lambda action: drive.controls(drive.command(action)))
+            return program.lower(np.zeros(self.env.action_size, np.float32)).compile()
 
     def _discarded(self, time: float) -> Step:
         """Restore the state before a non-finite step, and return its result."""

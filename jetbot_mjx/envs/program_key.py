@@ -41,7 +41,7 @@ _NOT_IN_PROGRAMS = {
 }
 """Settings that no program depends on: when a training ends, and what it reads and writes."""
 
-SOURCES = {".ll", ".py", ".pyi", ".xml"}
+SOURCES = {".ll", ".py", ".pyi", ".xml", ".yaml"}
 """Suffixes of the files from which programs are made; a `.pyi` says what a face exports."""
 
 
@@ -96,8 +96,7 @@ def _model(config: Config) -> str:
     from jetbot_mjx.envs import robot_model, task
 
     scene = task.make_task(config.task).build_scene
-    robot = robot_model.ROBOTS[config.robot.preset]
-    model = robot_model.make_mj_model(robot, config.physics, build_scene=scene, visual=False)
+    model = robot_model.make_mj_model(config.robot, config.physics, build_scene=scene, visual=False)
     content = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
     return hashlib.sha256(content.tobytes()).hexdigest()

@@ -1,130 +1,27 @@
-"""Define the robot: the numbers of two presets, and the MuJoCo model made from them.
+"""Make the MuJoCo model of the robot and its scene.
 
-Every number has its unit and its source. All positions are in the body frame: the origin is the
-midpoint of the wheel axle, x is forward, y is left, z is up. Units are SI units.
-
-Sources, by tag:
-  CAD    NVIDIA-AI-IOT/jetbot, assets/*.stl and *.step, measured.
-  BOM    NVIDIA-AI-IOT/jetbot, docs/bill_of_materials.md.
-  USD    a public copy of Isaac's jetbot.usd (snt-spacer/RobRAN-Code), read with usd-core.
-  ISAAC  Isaac Sim 2022.x documentation, section 9.9, and its `DifferentialController`.
-  EST    an estimate; the comment names its basis.
-  SIM    chosen in simulation and checked by `tests/envs/test_robot_model.py`.
+The JetBot is made from its measures; another robot is a model of its own, as of `mjcf_robot`. All
+positions are in the body frame: the origin is the midpoint of the wheel axle, x is forward, y
+is left, z is up. Units are SI units.
 """
 
-import dataclasses
 from collections.abc import Callable
 from importlib import resources
 
 import mujoco
 import numpy as np
 
-from jetbot_mjx.config import PhysicsConfig
+from jetbot_mjx.config import MjcfRobotConfig, PhysicsConfig, RobotConfig, TaskConfig
+from jetbot_mjx.envs import mjcf_robot
 from jetbot_mjx.errors import UserError
 
-# The tutorial's controller assumes a geometry of its own: the mismatch of 1.3 % between its wheel
-# base and the true wheel separation is part of the task.
-CONTROLLER_WHEEL_RADIUS = 0.0325  # [m] ISAAC, DifferentialController(wheel_radius=0.0325)
-CONTROLLER_WHEEL_SEPARATION = 0.1125  # [m] ISAAC, wheel_base=0.1125: left to right
+_LARGEST_LEAN = np.radians(15.0)  # SIM: further over, the camera and the chassis are elsewhere
 
-WHEEL_RADIUS = 0.0325  # [m] BOM: 65 mm wheel; CAD: its caster puts the axle 32.5 mm up
-WHEEL_SEPARATION = 0.114  # [m] USD: wheel meshes centred at y = ±0.0570
+_DRAWN_CHASSIS = np.array([0.136, 0.090, 0.054])  # [m] that of `assets/jetbot.xml`
+_DRAWN_WHEEL = np.array([0.0325, 0.0195])  # [m] its radius and its width
 
 QPOS_XYZ, QPOS_QUAT = slice(0, 3), slice(3, 7)
 QVEL_LINEAR_W, QVEL_ANGULAR_B = slice(0, 3), slice(3, 6)
-
-
-@dataclasses.dataclass(frozen=True)
-class Caster:
-    """A `Caster` describes a frictionless ball under the chassis."""
-
-    name: str
-    """Name of its collision geom."""
-    radius: float
-    """Radius of the ball [m]."""
-    pos: tuple[float, float, float]
-    """Centre of the ball [m]."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Robot:
-    """A `Robot` holds the physical parameters of a JetBot."""
-
-    chassis_mass: float
-    """Mass without the wheels [kg]."""
-    chassis_com: tuple[float, float, float]
-    """Centre of mass of the chassis [m]."""
-    chassis_inertia: tuple[float, float, float]
-    """Principal moments of the chassis about its centre of mass [kg m²]."""
-    wheel_mass: float
-    """Mass of one wheel [kg]."""
-    wheel_inertia: tuple[float, float, float]
-    """Moments of inertia of a wheel about x, y (the axle) and z [kg m²]."""
-    casters: tuple[Caster, ...]
-    """Casters of the chassis."""
-    motor_torque: float
-    """Largest torque of a motor at the wheel [N m]."""
-    motor_gain: float
-    """Gain of the speed controller: torque per error of the wheel speed [N m s/rad]."""
-    armature: float
-    """Rotor inertia, reflected through the gear to the wheel [kg m²]."""
-    max_wheel_speed: float | None
-    """Limit of the commanded wheel speed [rad/s]; None: not limited."""
-    friction: float = 1.0
-    """Coulomb friction coefficient between wheel and floor. USD: 1.0, combined by maximum."""
-
-
-def _box_inertia(mass: float, size: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the principal moments of a homogeneous box [kg m²] from mass [kg] and sides [m]."""
-    x, y, z = (side * side for side in size)
-    return mass / 12 * (y + z), mass / 12 * (x + z), mass / 12 * (x + y)
-
-
-def _wheel_inertia(mass: float, width: float) -> tuple[float, float, float]:
-    """Return the moments of a homogeneous wheel [kg m²] from mass [kg] and width [m]."""
-    spin = mass * WHEEL_RADIUS**2 / 2
-    across = mass * (3 * WHEEL_RADIUS**2 + width**2) / 12
-    return across, spin, across
-
-
-_CHASSIS_SIZE = (0.136, 0.090, 0.054)  # [m] CAD, envelope of the printed chassis
-
-ISAAC = Robot(
-    chassis_mass=2.0,  # USD
-    # EST: the USD has none. Midway between the casters at the height of the axle, which keeps
-    # Isaac's robot on its wheels at 1 m/s.
-    chassis_com=(-0.022, 0.0, 0.0),
-    chassis_inertia=_box_inertia(2.0, _CHASSIS_SIZE),  # EST: homogeneous box
-    wheel_mass=0.25,  # USD
-    wheel_inertia=_wheel_inertia(0.25, width=0.0195),  # USD: width of the wheel mesh
-    casters=(
-        # USD: radius 4.76 mm, bottoms 0.5 mm above the wheels' contact plane.
-        Caster("caster_front", 0.00476, (0.038, 0.0, -WHEEL_RADIUS + 0.0005 + 0.00476)),
-        Caster("caster_rear", 0.00476, (-0.082, 0.0, -WHEEL_RADIUS + 0.0005 + 0.00476)),
-    ),
-    motor_torque=0.1,  # SIM: keeps the worst tilt under 1.5°
-    motor_gain=0.05,  # SIM: Isaac's 1e4 is unstable at any useful time step
-    armature=3e-4,  # EST: rotor 1.4e-7 kg m² through the 1:48 gear
-    max_wheel_speed=None,  # the tutorial's 1 m/s needs 31 rad/s; USD would stop at 12.56
-)
-
-REAL = Robot(
-    chassis_mass=0.634,  # EST: sum of the BOM's parts, 0.69 kg in total (0.60 to 0.85)
-    chassis_com=(-0.0346, 0.0, 0.0257),  # EST: the BOM's parts at their CAD places
-    chassis_inertia=(6.2e-4, 1.08e-3, 1.14e-3),  # EST: likewise
-    wheel_mass=0.030,  # EST: a TT-motor wheel of 65 mm
-    wheel_inertia=(8.9e-6, 1.6e-5, 8.9e-6),  # EST: likewise
-    casters=(
-        # CAD: one 1-inch ball, 82 mm behind the axle, touching the floor.
-        Caster("caster_rear", 0.0127, (-0.082, 0.0, -WHEEL_RADIUS + 0.0127)),
-    ),
-    motor_torque=0.064,  # a TT motor's stall torque (0.8 kg cm at 6 V), scaled to 5 V
-    motor_gain=0.05,  # SIM, as above
-    armature=3e-4,  # EST, as above
-    max_wheel_speed=12.56,  # [rad/s] USD, maxJointVelocity 719.635 °/s: 0.41 m/s
-)
-
-ROBOTS = {"isaac": ISAAC, "real": REAL}
 
 # Contact parameters of every pair, softer than MuJoCo's defaults. In a pyramidal cone the friction
 # of a sliding wheel also pushes it off the floor, more so in a stiffer contact: with μ = 0.4,
@@ -134,7 +31,7 @@ _SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)  # SIM
 
 
 def make_mj_model(
-    robot: Robot,
+    robot: RobotConfig | MjcfRobotConfig,
     physics: PhysicsConfig,
     *,
     build_scene: Callable[[mujoco.MjSpec], None] = lambda spec: None,
@@ -143,30 +40,52 @@ def make_mj_model(
     """Compile the robot and its scene.
 
     Args:
-      robot: the physical parameters.
+      robot: the section `robot` of the configuration.
       physics: the physics section of the configuration: time step and solver settings.
       build_scene: a function that adds a task's bodies to the scene.
       visual: whether to include visual elements. They do not change physics, but cost kernels.
 
     Returns:
-      The C model. Its `qpos` is (x, y, z, w, x, y, z, left, right), and in its initial pose,
-      `qpos0`, the robot is at rest on the floor.
+      The C model. Its `qpos` begins with (x, y, z, w, x, y, z) of the robot's body, and of a JetBot
+      ends with the wheels (left, right). In its initial pose, `qpos0`, the robot is at rest on the
+      floor.
 
     Raises:
-      UserError: the physics time step is too long for the robot's motors.
+      UserError: the physics time step is too long for the robot's motors, it leans at rest, or
+        its own model cannot be used.
       RuntimeError: the robot does not come to rest in this scene.
       ValueError: MuJoCo rejects the scene.
     """
     text = resources.files("jetbot_mjx").joinpath("assets/jetbot.xml").read_text()
     spec = mujoco.MjSpec.from_string(text)
-    _check_stable(robot, physics)
     _set_options(spec, physics)
-    _set_robot(spec, robot)
+    if isinstance(robot, MjcfRobotConfig):
+        _remove_jetbot(spec)
+        mjcf_robot.add_robot(spec, robot)
+        # What is wrong with a wheel would otherwise be told as a robot that does not rest.
+        mjcf_robot.find_drive(robot, TaskConfig(), spec.compile())
+    else:
+        _check_stable(robot, physics)
+        _scale_looks(spec, robot)
+        _set_robot(spec, robot)
     build_scene(spec)
     if not visual:
         _remove_visuals(spec)
     _settle(spec)
     return spec.compile()
+
+
+def robot_body(model: mujoco.MjModel) -> str:
+    """Return the name of the robot's body, which the first joint moves."""
+    return model.body(int(model.jnt_bodyid[0])).name
+
+
+def _remove_jetbot(spec: mujoco.MjSpec) -> None:
+    """Leave the scene alone, without the JetBot and what MuJoCo's default would not do."""
+    for actuator in spec.actuators:
+        spec.delete(actuator)
+    spec.delete(spec.body("jetbot"))
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
 
 
 def mocap_ids(model: mujoco.MjModel) -> dict[str, int]:
@@ -175,9 +94,9 @@ def mocap_ids(model: mujoco.MjModel) -> dict[str, int]:
     return {model.body(body).name: index for index, body in enumerate(bodies)}
 
 
-def _check_stable(robot: Robot, physics: PhysicsConfig) -> None:
+def _check_stable(robot: RobotConfig, physics: PhysicsConfig) -> None:
     """Check the stability of explicit Euler: timestep * motor_gain / wheel inertia < 2."""
-    limit = 2.0 * (robot.wheel_inertia[1] + robot.armature) / robot.motor_gain
+    limit = 2.0 * (robot.moments_of_wheel[1] + robot.armature) / robot.motor_gain
     if physics.sim_dt >= limit:
         raise UserError(
             f"physics.sim_dt = {physics.sim_dt:g} is too long: this robot's motors are stable"
@@ -198,21 +117,36 @@ def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     option.tolerance = physics.tolerance
 
 
-def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
+def _scale_looks(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
+    """Scale what only shows to the size of chassis and wheels."""
+    scale = robot.chassis_size / _DRAWN_CHASSIS
+    for geom in spec.body("jetbot").geoms:
+        geom.pos = geom.pos * scale
+        geom.fromto = geom.fromto * np.tile(scale, 2)
+        if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
+            geom.size = geom.size * scale
+    radius, width = np.array([robot.wheel_radius, robot.wheel_width]) / _DRAWN_WHEEL
+    for side in ("left", "right"):
+        for geom in spec.body(f"{side}_wheel").geoms:
+            is_box = geom.type == mujoco.mjtGeom.mjGEOM_BOX
+            geom.size = geom.size * ((radius, width, radius) if is_box else (radius, width, 1.0))
+
+
+def _set_robot(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
     """Set masses, geometry, motors and contacts of the robot."""
     # Chassis and wheels.
     chassis = spec.body("jetbot")
     chassis.mass = robot.chassis_mass
     chassis.ipos = robot.chassis_com
-    chassis.inertia = robot.chassis_inertia
+    chassis.inertia = robot.moments_of_chassis
     for side, sign in (("left", 1.0), ("right", -1.0)):
         wheel = spec.body(f"{side}_wheel")
-        wheel.pos = (0.0, sign * WHEEL_SEPARATION / 2, 0.0)
+        wheel.pos = (0.0, sign * robot.wheel_separation / 2, 0.0)
         wheel.mass = robot.wheel_mass
-        wheel.inertia = robot.wheel_inertia
+        wheel.inertia = robot.moments_of_wheel
         # A sphere touches a plane in the same single point as a wheel; a cylinder has several
         # contacts, which jitter.
-        spec.geom(f"{side}_wheel").size = (WHEEL_RADIUS, 0.0, 0.0)
+        spec.geom(f"{side}_wheel").size = (robot.wheel_radius, 0.0, 0.0)
         spec.joint(f"{side}_wheel_joint").armature = robot.armature
         motor = spec.actuator(side)
         motor.set_to_velocity(kv=robot.motor_gain)
@@ -223,16 +157,16 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
             motor.ctrllimited = True
         slide = robot.friction
         _add_pair(spec, f"{side}_wheel", condim=3, friction=(slide, slide, 5e-3, 1e-4, 1e-4))
-    # Casters.
-    casters = {caster.name: caster for caster in robot.casters}
-    for name in ("caster_front", "caster_rear"):
-        if name not in casters:
-            spec.delete(spec.geom(name))
-            spec.delete(spec.geom(f"{name}_ball"))
-            continue
-        for geom in (spec.geom(name), spec.geom(f"{name}_ball")):
-            geom.pos = casters[name].pos
-            geom.size = (casters[name].radius, 0.0, 0.0)
+    # Casters: those that collide, then those that show.
+    balls = {f"caster_{i}": caster for i, caster in enumerate(robot.casters)}
+    for suffix, looks in (("", spec.find_default("collider")), ("_ball", None)):
+        for name, caster in balls.items():
+            height = -robot.wheel_radius + caster.clearance + caster.radius
+            ball = chassis.add_geom(looks, name=name + suffix, type=mujoco.mjtGeom.mjGEOM_SPHERE)
+            ball.pos, ball.size = (caster.x, caster.y, height), (caster.radius, 0.0, 0.0)
+            if looks is None:
+                ball.material = "metal"
+    for name in balls:
         _add_pair(spec, name, condim=1)
 
 
@@ -263,7 +197,9 @@ def _remove_visuals(spec: mujoco.MjSpec) -> None:
     """Remove all elements that do not take part in physics."""
     paired = {pair.geomname1 for pair in spec.pairs} | {pair.geomname2 for pair in spec.pairs}
     for geom in spec.geoms:
-        if geom.name not in paired and not geom.contype and not geom.conaffinity:
+        collides = geom.name in paired or geom.contype or geom.conaffinity
+        # The mass of a body that does not state its own is that of its geoms.
+        if not collides and (geom.mass == 0 or geom.parent.explicitinertial):
             spec.delete(geom)
     for element in (*spec.cameras, *spec.lights, *spec.sites):
         spec.delete(element)
@@ -279,11 +215,23 @@ def _settle(spec: mujoco.MjSpec) -> None:
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
     data = mujoco.MjData(model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    data.warning.number[:] = 1  # they are told below, and MuJoCo would print the first of a kind
     mujoco.mj_step(model, data, nstep=int(2.0 / model.opt.timestep))
-    if not np.all(np.isfinite(data.qpos)) or np.max(np.abs(data.qvel)) > 1e-3:
-        raise RuntimeError(f"the robot does not come to rest: qvel = {data.qvel}")
+    fastest = np.max(np.abs(data.qvel))
+    if not np.all(np.isfinite(data.qpos)) or fastest > 1e-3:
+        raise RuntimeError(
+            f"the robot does not come to rest: after 2 s it moves with up to {fastest:.3g} m/s or"
+            " rad/s: it falls over, or something pushes it"
+        )
     # Keep only height and pitch: the robot may have crept along the floor.
-    body = spec.body("jetbot")
+    body = spec.body(robot_body(model))
     body.pos = (0.0, 0.0, data.qpos[2])
     pitch = 2.0 * np.arcsin(data.qpos[5])
+    if abs(pitch) > _LARGEST_LEAN:
+        raise UserError(
+            f"at rest the robot leans {np.degrees(abs(pitch)):.0f}° to the"
+            f" {'front' if pitch > 0 else 'rear'}: support it there, as by a caster closer to the"
+            " floor"
+        )
     body.quat = (np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0)

@@ -54,6 +54,33 @@ def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, robot_params: RobotPa
     return model.replace(**changed)
 
 
+def vary_own_model(model: mjx.Model, robot_params: RobotParams) -> mjx.Model:
+    """Return the model of a varied robot that is a model of its own.
+
+    Its friction is that of all geoms, of which the larger counts in a contact. Constants that
+    MuJoCo derives from the masses stay those of the model.
+
+    Args:
+      model: the robot's MJX model.
+      robot_params: the robot parameters; friction, mass and centre of mass are used.
+    """
+    changed = {}
+    if robot_params.differs("friction"):
+        for name in ("geom_friction", "pair_friction"):
+            values = getattr(model, name)
+            sliding = np.arange(values.shape[1]) < (1 if name == "geom_friction" else 2)
+            changed[name] = values * jnp.where(sliding, robot_params.friction, 1.0)
+    body = np.arange(model.nbody) == model.jnt_bodyid[0]
+    if robot_params.differs("mass"):
+        mass = jnp.where(body, robot_params.mass, 1.0)
+        changed["body_mass"] = model.body_mass * mass
+        changed["body_inertia"] = model.body_inertia * mass[:, None]
+    if robot_params.differs(*_COM):
+        shift = jnp.where(body[:, None], _com_shift(robot_params), 0.0)
+        changed["body_ipos"] = model.body_ipos + shift
+    return model.replace(**changed)
+
+
 def _com_shift(robot_params: RobotParams) -> Float[Array, "3"]:
     return jnp.stack([jnp.asarray(getattr(robot_params, name)) for name in _COM])
 

@@ -161,7 +161,7 @@ class Task(Protocol):
         ...
 
     def reward(
-        self, before: RobotState, after: RobotState, goal: Goal, action: Float[Array, "2"]
+        self, before: RobotState, after: RobotState, goal: Goal, action: Float[Array, " action"]
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
         """Return the reward of one step and its named terms; names are the same at every step."""
         ...
@@ -292,7 +292,7 @@ class GoalTask:
         return jnp.concatenate([goal_b, direction, scalars])
 
     def reward(
-        self, before: RobotState, after: RobotState, goal: Goal, action: Float[Array, "2"]
+        self, before: RobotState, after: RobotState, goal: Goal, action: Float[Array, " action"]
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
         """Return the progress towards the goal in this step [m], d(t-1) - d(t)."""
         progress = self.distance(before, goal) - self.distance(after, goal)

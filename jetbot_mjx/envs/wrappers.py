@@ -36,13 +36,13 @@ class _Env(Protocol):
 
     def reset(self, rng: UInt32[Array, "2"]) -> State: ...
 
-    def step(self, state: State, action: Float[Array, "2"]) -> State: ...
+    def step(self, state: State, action: Float[Array, " action"]) -> State: ...
 
 
 class _PackedEnv(_Env, Protocol):
     """The interface that a batch requires of the environment inside it."""
 
-    def step_packed(self, packed: Packed, action: Float[Array, "2"]) -> Packed: ...
+    def step_packed(self, packed: Packed, action: Float[Array, " action"]) -> Packed: ...
 
 
 def wrap_for_training(
@@ -163,7 +163,7 @@ class EpisodeWrapper(Wrapper):
         }
         return state.replace(metrics=metrics, info=info)
 
-    def step(self, state: State, action: Float[Array, "2"]) -> State:
+    def step(self, state: State, action: Float[Array, " action"]) -> State:
         """Make one step of up to `action_repeat` environment steps.
 
         Args:
@@ -203,7 +203,7 @@ class EpisodeWrapper(Wrapper):
         return nstate.replace(done=done, metrics=metrics, info=info)
 
     def _repeat(
-        self, state: State, action: Float[Array, "2"], steps: Float[Array, ""]
+        self, state: State, action: Float[Array, " action"], steps: Float[Array, ""]
     ) -> tuple[State, Float[Array, ""]]:
         """Repeat an action `action_repeat` times, or until the episode ends.
 
@@ -247,7 +247,7 @@ class NewEpisodeWrapper(Wrapper):
 
     env: _Env
 
-    def step(self, state: State, action: Float[Array, "2"]) -> State:
+    def step(self, state: State, action: Float[Array, " action"]) -> State:
         """Make one step, and reset the environment if the episode ended.
 
         Args:
@@ -296,7 +296,7 @@ class KernelWrapper(Wrapper):
                 on_fallback=physics.kernel_impl.report_fallback,
             )
 
-        def step_packed(packed: Packed, action: Float[Array, "2"]) -> Packed:
+        def step_packed(packed: Packed, action: Float[Array, " action"]) -> Packed:
             return pack(self.env.step(packed.unpack(), action))
 
         self.reset = compiled(self.env.reset)
@@ -318,7 +318,7 @@ class BatchWrapper(Wrapper):
         """
         return self._call("reset", rng)
 
-    def step(self, state: State, action: Float[Array, "n 2"]) -> State:
+    def step(self, state: State, action: Float[Array, "n action"]) -> State:
         """Step every environment.
 
         Args:

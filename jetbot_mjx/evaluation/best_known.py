@@ -23,7 +23,6 @@ FORMAT = "jetbot_mjx-best-known/1"
 """Format of that file."""
 
 SETTINGS = (
-    "robot.preset",
     "task.name",
     "task.max_speed",
     "task.max_yaw_rate",
@@ -33,15 +32,15 @@ SETTINGS = (
     "physics.ctrl_dt",
     "physics.sim_dt",
 )
-"""Settings that the goals and the times to them depend on."""
+"""Settings that the goals and the times to them depend on, besides the robot."""
 
 _GOAL_TOLERANCE = 1.5e-3  # [m] The file holds whole millimetres.
 
 
 def settings_of(config: Config) -> JsonObject:
-    """Return the settings of a configuration that the times depend on, by key."""
+    """Return the robot and the settings of a configuration that the times depend on, by key."""
     flat = config.flat()
-    return {name: flat[name] for name in SETTINGS}
+    return {"robot.preset": config.robot.label, **{name: flat[name] for name in SETTINGS}}
 
 
 def find(config: Config, episodes: Episodes) -> Float[np.ndarray, " n"] | str:
@@ -65,7 +64,7 @@ def find(config: Config, episodes: Episodes) -> Float[np.ndarray, " n"] | str:
     ours = settings_of(config)
 
     def differing(search: JsonObject) -> list[str]:
-        return [name for name in SETTINGS if search["settings"][name] != ours[name]]
+        return [name for name, value in ours.items() if search["settings"][name] != value]
 
     search = min(searches, key=lambda one: len(differing(one)))
     if names := differing(search):

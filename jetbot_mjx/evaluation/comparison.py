@@ -138,7 +138,7 @@ def check_comparable(configs: Mapping[str, Config]) -> None:
     """
     (first, wanted), *others = ((name, _task_settings(config)) for name, config in configs.items())
     for name, found in others:
-        for key in sorted(wanted.keys() | found.keys()):
+        for key in {**wanted, **found}:
             if wanted.get(key) != found.get(key):
                 raise UserError(
                     f"{name} cannot be compared with {first}: {key} = {found.get(key)!r}, and not"
@@ -182,7 +182,7 @@ def compare(folder: Path, runs: Mapping[str, Mapping[str, Report]]) -> Compariso
     return Comparison(
         folder=folder,
         episodes=first.policy.episodes,
-        settings=_task_settings(first.config),
+        settings={"robot": first.config.robot.label, **_task_settings(first.config)},
         runs=rows,
         pairs=tuple(_pair(a, b) for a, b in itertools.combinations(rows, 2)),
         differences=_differences([next(iter(seeds.values())).config for seeds in runs.values()]),

@@ -287,7 +287,7 @@ def _turn_then_go(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
     damping = 0.3  # reduction of the yaw rate per yaw rate, against oscillation by motor lag
     cone = 0.6  # [rad] heading error within which it drives
 
-    def act(params: PyTree, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
+    def act(params: PyTree, state: State, key: UInt32[Array, "2"]) -> Float[Array, " action"]:
         robot = envs.robot_state(state.pipeline_state)
         offset_w = env.task.goal_position(state.goal)[:2] - robot.position_w[:2]
         goal_b = envs.to_body(envs.yaw(robot.quat), offset_w)
@@ -295,11 +295,7 @@ def _turn_then_go(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
         aligned = (jnp.cos(error) - math.cos(cone)) / (1.0 - math.cos(cone))
         speed = env.config.task.max_speed * jnp.maximum(aligned, 0.0)
         yaw_rate = steering * error - damping * robot.angular_velocity_w[2]
-        return envs.action_from_twist(
-            jnp.stack([speed, yaw_rate]),
-            max_speed=env.config.task.max_speed,
-            max_yaw_rate=env.config.task.max_yaw_rate,
-        )
+        return env.action_of_twist(jnp.stack([speed, yaw_rate]))
 
     return act
 

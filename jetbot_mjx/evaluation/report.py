@@ -35,12 +35,11 @@ _EDGE_STEP = 0.05  # [m] step to which the edges of the rings are rounded
 _SETTINGS = (
     "seed",
     "trainer",
-    "robot.preset",
     "physics.ctrl_dt",
     "ppo.num_timesteps",
     "ppo.network.policy_hidden_layer_sizes",
 )
-"""Settings of the configuration that a report shows, besides those of the task."""
+"""Settings of the configuration that a report shows, besides the robot and those of the task."""
 
 
 class GoalBin(NamedTuple):
@@ -192,7 +191,8 @@ class Report(NamedTuple):
         converted = {
             "run": self.name,
             "checkpoint": self.checkpoint.name,
-            "settings": {
+            "settings": {"robot": self.config.robot.label}
+            | {
                 key: value
                 for key, value in self.config.flat().items()
                 if key in _SETTINGS or key.startswith("task.")

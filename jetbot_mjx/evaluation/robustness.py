@@ -99,12 +99,15 @@ class Sweeper:
         Args:
           setup: the environment with its preset's robot, and the networks of the policies.
           keys: one reset key for each episode, such as `report_keys(128)`.
-          sweeps: the parameters with their values; without a camera, those of looks are left out.
+          sweeps: the parameters with their values; those that the robot does not have,
+            and without a camera those of looks, are left out.
         """
         env, networks = setup.env, setup.networks
         sees = env.camera is not None
         self._env, self._keys = env, keys
-        self._sweeps = tuple(one for one in sweeps if sees or not one.is_look)
+        self._sweeps = tuple(
+            one for one in sweeps if (sees if one.is_look else one.name in env.robot.quantities)
+        )
         # The preset's robot occurs in every sweep, but is evaluated only once.
         self._variants = list(dict.fromkeys(v for one in self._sweeps for v in one.variants))
         # Run robots one after the other on a CPU: the solver iterates until the last robot of a

@@ -25,7 +25,7 @@ _ACTION_DRAWS = 0x61637473
 _PATH = "path_length"
 """Key of the distance travelled in the state's `info` [m]."""
 
-Controller = Callable[[PyTree, State, UInt32[Array, "2"]], Float[Array, "2"]]
+Controller = Callable[[PyTree, State, UInt32[Array, "2"]], Float[Array, " action"]]
 
 
 class Episodes(NamedTuple):
@@ -80,7 +80,7 @@ class _OneEpisodeWrapper(Wrapper):
         state = self.env.reset(rng)
         return state.replace(info={**state.info, _PATH: jnp.zeros(())})
 
-    def step(self, state: State, action: Float[Array, "2"]) -> State:
+    def step(self, state: State, action: Float[Array, " action"]) -> State:
         """Make one step, unless the episode has ended."""
         nstate: PyTree = self.env.step(state, action)
         moved = jnp.linalg.norm(
@@ -121,7 +121,7 @@ def rollout_fn(
     def run(index: int | Int[Array, ""], params: PyTree, keys: UInt32[Array, "n 2"]) -> Episodes:
         first = batch.reset(keys)
 
-        def act(state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
+        def act(state: State, key: UInt32[Array, "2"]) -> Float[Array, " action"]:
             branches = [lambda s, k, c=c: c(params, s, k) for c in controllers]
             return jax.lax.switch(index, branches, state, key)
 

@@ -12,13 +12,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jetbot_mjx import agents
 from jetbot_mjx.agents import Networks, Policy, PolicyParams
-from jetbot_mjx.config import Config, parse_config
+from jetbot_mjx.config import Config
 from jetbot_mjx.devices import require_float32
 from jetbot_mjx.envs import JetBotEnv, LayoutData, layout_data
 from jetbot_mjx.errors import InvalidError, UserError, os_errors, shown
 from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint_store import FOLDER, CheckpointError, CheckpointNotFoundError
-from jetbot_mjx.runs.run_dir import JsonObject
+from jetbot_mjx.runs.run_dir import JsonObject, parse_stored
 from jetbot_mjx.runs.run_finder import PRETRAINED as PRETRAINED
 from jetbot_mjx.runs.run_finder import ROOT, explain_missing, find_run, scan_runs, suggest_run
 from jetbot_mjx.runs.setup import Setup
@@ -146,7 +146,7 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
     about = explanation(folder)
     size = about["observation_size"]
     try:
-        config = parse_config(about["config"], source="stored config")
+        config = parse_stored(about["config"], folder.parent.parent, "stored config")
         networks = agents.make_networks(config.ppo, size, about["action_size"])
         template = jax.eval_shape(
             lambda key: PolicyParams(

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jetbot_mjx.agents import NanDump
-from jetbot_mjx.config import Config, ConfigError, parse_config
+from jetbot_mjx.config import Config, ConfigError
 from jetbot_mjx import envs
 from jetbot_mjx.envs import JetBotEnv, State, Task
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import flatten
-from jetbot_mjx.runs.run_dir import read_bytes, write_bytes
+from jetbot_mjx.runs.run_dir import parse_stored, read_bytes, write_bytes
 from jetbot_mjx.runs.task_code import stored_task_class
 
 FOLDER = "nan_dumps"
@@ -92,8 +92,8 @@ def load_nan_dump(path: Path) -> StoredNanDump:
         about = json.loads(str(arrays.pop("about")))
         if about["format"] != _FORMAT:
             raise InvalidError(f"{path} has the format {shown(about['format'])}, not {_FORMAT!r}")
-        config = parse_config(about["config"], source="stored config")
         run_dir = Path(path).absolute().parent.parent
+        config = parse_stored(about["config"], run_dir, "stored config")
         task_class = stored_task_class(run_dir, config.task.name)
         template = _template(config, task_class)
         wanted = flatten(template)

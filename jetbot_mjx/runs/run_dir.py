@@ -16,11 +16,20 @@ import shutil
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from jetbot_mjx.config import Config, ConfigError, parse_config, parse_yaml
+from jetbot_mjx.config import (
+    FOLDER,
+    Config,
+    ConfigError,
+    MjcfRobotConfig,
+    model_files,
+    parse_config,
+    parse_yaml,
+    register,
+)
 from jetbot_mjx.envs import LIBRARIES, installed_version
 from jetbot_mjx.errors import UserError, clipped, os_errors
 
@@ -103,7 +112,7 @@ def read_config(run_dir: Path) -> Config:
         values = parse_yaml(text, CONFIG)
         if _LAST_SECTION not in values:
             raise ConfigError(f"{CONFIG} was cut off: it has no section {_LAST_SECTION}")
-        return parse_config(values, CONFIG)
+        return parse_stored(values, run_dir, CONFIG)
     except FileNotFoundError:
         raise DamagedRunError(run_dir, f"{CONFIG} is missing") from None
     except UnicodeDecodeError:
@@ -112,6 +121,24 @@ def read_config(run_dir: Path) -> Config:
         raise DamagedRunError(run_dir, f"{CONFIG} cannot be read: {error.strerror}") from None
     except ConfigError as error:
         raise DamagedRunError(run_dir, str(error)) from None
+
+
+def parse_stored(values: Mapping[str, object], run_dir: Path, source: str) -> Config:
+    """Check the settings that a run stored, and read the model of its robot, if that is a file.
+
+    Args:
+      values: the settings.
+      run_dir: the run folder.
+      source: description of their origin for error messages.
+
+    Raises:
+      ConfigError: the settings are damaged.
+      DamagedRunError: the model's files are not those that the training stored.
+    """
+    config = parse_config(values, source)
+    if isinstance(config.robot, MjcfRobotConfig):
+        _read_model(run_dir, config.robot)
+    return config
 
 
 def stored_config(run_dir: Path) -> Config | None:
@@ -190,6 +217,29 @@ def write_run(run_dir: Path, config: Config, made_with: JsonObject) -> None:
     with writing_to(run_dir):
         write_text(run_dir / CONFIG, config.to_yaml())
         write_json(run_dir / _VERSIONS, made_with)
+        if isinstance(config.robot, MjcfRobotConfig):
+            _write_model(run_dir / FOLDER, config.robot)
+
+
+def _write_model(folder: Path, robot: MjcfRobotConfig) -> None:
+    """Write the files of a robot's model."""
+    for name, content in (model_files(robot.sha256) or {}).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(folder / name, content)
+
+
+def _read_model(run_dir: Path, robot: MjcfRobotConfig) -> None:
+    """Read the files of a robot's model, unless this process has them.
+
+    Raises:
+      DamagedRunError: they are not those that the training stored.
+    """
+    path = run_dir / FOLDER / robot.file
+    code = robot.drive.partition(":")[0] if robot.has_own_drive else None
+    if model_files(robot.sha256) is None and register(path, code) != robot.sha256:
+        raise DamagedRunError(
+            run_dir, f"{FOLDER}/ does not hold the files of the robot's model that it began with"
+        )
 
 
 def changed_versions(run_dir: Path) -> list[str]:

@@ -155,7 +155,7 @@ def read_info(run_dir: Path) -> RunInfo:
     task = config.task
     return RunInfo(
         path=run_dir,
-        task=f"{clipped(task.name, 60)} {config.robot.preset} {task.observation}",
+        task=f"{clipped(task.name, 60)} {config.robot.label} {task.observation}",
         env_steps=history[-1].env_steps if history else 0,
         num_timesteps=config.ppo.num_timesteps,
         success_rate=max((x for x in rates if x is not None and 0 <= x <= 1), default=None),

@@ -90,7 +90,7 @@ class WandbSink:
         wandb = importlib.import_module("wandb")
         group = run_dir.parent.name if seeds > 1 else None
         task = config.task.name.rpartition(":")[2]
-        tags = (task, config.task.observation, config.robot.preset, config.trainer)
+        tags = (task, config.task.observation, config.robot.label, config.trainer)
         run = wandb.init(
             project=config.wandb,
             id=self._progress["id"],

@@ -491,4 +491,6 @@ def _check_config(config: Config) -> None:
 
 
 def _frozen(value: Setting) -> Value:
+    if isinstance(value, dict):
+        return tuple(_frozen([key, one]) for key, one in value.items())
     return tuple(map(_frozen, value)) if isinstance(value, list) else value

@@ -102,13 +102,12 @@ def make_viewer_fns(env: envs.JetBotEnv, networks: Networks) -> ViewerFns:
     episodes = envs.EpisodeWrapper(env.blind(), env.config.task.episode_length)
     episode_env = envs.with_camera(episodes, env.camera)
     controllers = [policy_controller(networks), *(make(env) for make in BASELINES.values())]
-    limits = {"max_speed": env.config.task.max_speed, "max_yaw_rate": env.config.task.max_yaw_rate}
 
     def step_one(state: envs.State, robot: Int[Array, ""], inputs: Inputs) -> envs.State:
         key = jax.random.fold_in(jax.random.fold_in(inputs.key, inputs.count), robot)
         branches = [
             *(lambda act=act: act(inputs.params, state, key) for act in controllers),
-            lambda: envs.action_from_twist(jnp.asarray(inputs.twist_b), **limits),
+            lambda: env.action_of_twist(jnp.asarray(inputs.twist_b)),
         ]
         return episode_env.step(state, jax.lax.switch(inputs.agent, branches))
 

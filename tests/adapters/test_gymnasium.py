@@ -19,7 +19,6 @@ from jetbot_mjx.adapters import JetBotGymEnv, JetBotVectorEnv
 from jetbot_mjx.adapters.base import observation_space
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
-from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
 from jetbot_mjx.envs.task import GOAL_HEIGHT
 from jetbot_mjx.errors import UserError
 
@@ -146,10 +145,7 @@ def test_wheel_speeds_are_the_controllers(env):
     actions[:4] = [[1, 1], [1, -1], [-1, 1], [-1, -1]]
     for action in actions:
         v, yaw_rate = (float(action[0]) + 1) / 2 * 1.0, float(action[1]) * np.pi
-        wanted = [
-            (2 * v + sign * yaw_rate * CONTROLLER_WHEEL_SEPARATION) / (2 * CONTROLLER_WHEEL_RADIUS)
-            for sign in (-1, 1)
-        ]
+        wanted = [(2 * v + sign * yaw_rate * 0.1125) / (2 * 0.0325) for sign in (-1, 1)]
         env.step(action)
         np.testing.assert_allclose(env.robot.data.ctrl, wanted, rtol=0, atol=1e-6)
         # In float32 a number of 36 rad/s is known to 4e-6.

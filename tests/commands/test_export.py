@@ -106,7 +106,7 @@ def test_every_network_is_written_as_it_is(activation, distribution, normalize, 
     obs = np.random.default_rng(0).normal(size=(200, 16)).astype(np.float32) * 3.0
     recording = outputs_of(checkpoint, env, obs=obs)
     assert recording.action.std() > 0.1
-    policy = portable_policy(checkpoint)
+    policy = portable_policy(checkpoint, checkpoint.make_env())
     for name in ("numpy", "onnx"):
         path = tmp_path / FORMATS[name].file
         FORMATS[name].write(policy, as_jax(checkpoint, env), path)
@@ -179,7 +179,8 @@ def test_the_contract_holds_the_summary_of_a_report(run_dir, tmp_path):
     checkpoint = load_checkpoint(run_dir)._replace(run_dir=tmp_path)
     folder = tmp_path / "evaluations" / checkpoint.path.name
     folder.mkdir(parents=True)
-    policy, env = portable_policy(checkpoint), checkpoint.make_env()
+    env = checkpoint.make_env()
+    policy = portable_policy(checkpoint, env)
     for text in ("", "{}", "[]"):
         (folder / "report.json").write_text(text)
         assert policy_spec(checkpoint, env, policy)["evaluation"] is None
@@ -333,7 +334,7 @@ def test_every_encoder_is_written_as_it_is(cnn, camera, observation, distributio
     network = {"cnn": cnn, "distribution_type": distribution, "cnn_dtype": "bfloat16"}
     settings = {"ppo": {"network": network}, "camera": camera, "task": {"observation": observation}}
     checkpoint, env = checkpoint_of(settings, tmp_path)
-    policy, rng = portable_policy(checkpoint), np.random.default_rng(0)
+    policy, rng = portable_policy(checkpoint, checkpoint.make_env()), np.random.default_rng(0)
     inputs = {
         name: rng.integers(256, size=(50, *one.shape), dtype=np.uint8)
         if name == "image"
@@ -419,7 +420,9 @@ def test_the_time_of_a_frame_is_told_for_every_file(seeing, capsys):
 def test_the_caller_stacks_images_as_the_environment_does(tmp_path):
     settings = {"task": {"observation": "camera"}, "camera": {"frames": 3}}
     checkpoint, env = checkpoint_of(settings, tmp_path)
-    FORMATS["numpy"].write(portable_policy(checkpoint), as_jax(checkpoint, env), tmp_path / "p.py")
+    FORMATS["numpy"].write(
+        portable_policy(checkpoint, env), as_jax(checkpoint, env), tmp_path / "p.py"
+    )
     stack = FORMATS["numpy"].read(tmp_path / "p.py").__globals__["stack"]
     before = None
     for images in record(checkpoint, env, 8).inputs["image"]:
@@ -484,7 +487,8 @@ def test_an_export_that_is_stopped_leaves_the_earlier_one(run_dir, exported, sho
     ],
 )
 def test_a_difference_is_seen(action, wheel_speeds, run_dir):
-    controller = portable_policy(load_checkpoint(run_dir)).controller
+    checkpoint = load_checkpoint(run_dir)
+    controller = portable_policy(checkpoint, checkpoint.make_env()).controller
     recording = Recording({"obs": np.zeros((2, 16))}, np.zeros((2, 2)), np.zeros((2, 2)))
     assert difference(recording, (action, wheel_speeds), controller) > TOLERANCE
     assert difference(recording, recording[1:], controller) == 0.0

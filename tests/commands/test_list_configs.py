@@ -10,6 +10,6 @@ def test_every_shipped_configuration_has_its_line(capsys):
     assert [line.split()[0] for line in lines] == list(shipped_configs())
     for line, path in zip(lines, shipped_configs().values(), strict=True):
         config = load_config(path)
-        assert f" {config.robot.preset} " in line
+        assert f" {config.robot.label} " in line
         assert f" {config.ppo.num_timesteps:,} steps in " in line
         assert line.endswith(", randomized") is bool(config.randomization.drawn)

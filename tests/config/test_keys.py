@@ -38,5 +38,5 @@ def test_a_key_written_with_a_dot_belongs_below_its_section():
 
 
 def test_where_nothing_is_like_it_the_keys_of_the_section_are_told():
-    assert likely_key(["robot", "zzz"]) == "known are preset"
+    assert likely_key(["evaluation", "zzz"]) == "known are episodes, video"
     assert likely_key(["zzz"]).startswith("known are seed, ")

@@ -8,7 +8,6 @@ from helpers import motion
 from jetbot_mjx.config import RobotParams
 from jetbot_mjx.envs.actuators import initial_actuator_state, step_actuators
 from jetbot_mjx.envs.domain_randomization import LARGEST_TRACED
-from jetbot_mjx.envs.robot_model import WHEEL_RADIUS, WHEEL_SEPARATION
 
 LONGEST = LARGEST_TRACED["action_delay"]
 
@@ -74,12 +73,12 @@ def test_wheels_of_another_size_and_distance_move_the_robot_as_kinematics_says(l
     robot_params = RobotParams(wheel_radius=1.04, wheel_separation=0.95)
     entered = drive(robot_params, [(left, right)])[0]
     as_entered = motion.body_twist(
-        jnp.asarray(entered), wheel_radius=WHEEL_RADIUS, wheel_separation=WHEEL_SEPARATION
+        jnp.asarray(entered), wheel_radius=0.0325, wheel_separation=0.114
     )
     true = motion.body_twist(
         jnp.array([left, right]),
-        wheel_radius=1.04 * WHEEL_RADIUS,
-        wheel_separation=0.95 * WHEEL_SEPARATION,
+        wheel_radius=1.04 * 0.0325,
+        wheel_separation=0.95 * 0.114,
     )
     np.testing.assert_allclose(as_entered, true, rtol=1e-5, atol=1e-7)
 

@@ -1,6 +1,5 @@
 """MJX's line search in float32: steps that it cannot resolve, and costs relative to the start."""
 
-import dataclasses
 import functools
 import threading
 
@@ -95,7 +94,7 @@ def physics_step(impl):
 def test_a_physics_step_ends_where_c_mujoco_converges(name, impl):
     friction, state, ctrl = STATES[name]
     env, step = physics_step(impl)
-    robot = dataclasses.replace(env.robot, friction=friction)
+    robot = env.robot.model_copy(update={"friction": friction})
     model = make_mj_model(robot, env.config.physics, visual=False)
     after = step(mjx.put_model(model), state, ctrl)
 

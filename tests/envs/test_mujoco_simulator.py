@@ -1,7 +1,5 @@
 """C MuJoCo in the place of MJX: the same robot and rules, and deterministic results."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -80,7 +78,7 @@ def test_with_the_numerics_of_training_it_drives_as_the_environment_does(preset_
     simulator = in_mujoco(preset_env, training_numerics(preset_env.config.physics))
     actions = held(uniform)
     distance = apart(trajectories(simulator, actions), trajectories(preset_env, actions))
-    print(f"\n{preset_env.config.robot.preset}: within {distance * 1e3:.3f} mm of MJX")
+    print(f"\n{preset_env.robot.label}: within {distance * 1e3:.3f} mm of MJX")
     assert distance < POSITION_TOLERANCE
 
 
@@ -104,14 +102,15 @@ def test_many_robots_in_batches_are_the_robot_of_mujocos_own_loop(preset_env):
     indirect=["preset_env"],
 )
 def test_a_varied_robot_is_the_one_that_mujoco_compiles(preset_env, mass, shift):
-    robot = dataclasses.replace(
-        preset_env.robot,
-        chassis_com=tuple(np.add(preset_env.robot.chassis_com, shift)),
-        chassis_mass=mass * preset_env.robot.chassis_mass,
-        chassis_inertia=tuple(mass * moment for moment in preset_env.robot.chassis_inertia),
-        friction=0.7,
-        max_wheel_speed=None,
-    )
+    moments = preset_env.robot.moments_of_chassis
+    changed = {
+        "chassis_com": tuple(np.add(preset_env.robot.chassis_com, shift)),
+        "chassis_mass": mass * preset_env.robot.chassis_mass,
+        "chassis_inertia": tuple(mass * moment for moment in moments),
+        "friction": 0.7,
+        "max_wheel_speed": None,
+    }
+    robot = preset_env.robot.model_copy(update=changed)
     simulator = in_mujoco(preset_env, training_numerics(preset_env.config.physics))
     varied = DomainRandomizationWrapper(simulator, RobotParams(0.7, mass, *shift))
     actions = held(uniform)
@@ -123,7 +122,12 @@ def test_a_varied_robot_is_the_one_that_mujoco_compiles(preset_env, mass, shift)
 
 
 def test_derived_model_values_follow_the_masses(preset_env):
-    heavy = dataclasses.replace(preset_env.robot, chassis_mass=1.3 * preset_env.robot.chassis_mass)
+    robot = preset_env.robot
+    changed = {
+        "chassis_mass": 1.3 * robot.chassis_mass,
+        "chassis_inertia": robot.moments_of_chassis,
+    }
+    heavy = robot.model_copy(update=changed)
     compiled = make_mj_model(heavy, preset_env.config.physics, visual=False)
     preset = make_model(preset_env, training_numerics(preset_env.config.physics))
     mass = compiled.body_mass[None].astype(np.float32)

@@ -1,7 +1,6 @@
 """MJX against C MuJoCo and closed-form solutions."""
 
 import copy
-import dataclasses
 import functools
 import math
 import re
@@ -15,7 +14,7 @@ import pytest
 from helpers import motion
 from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
-from jetbot_mjx.envs import kinematics, mjx, robot_model
+from jetbot_mjx.envs import kinematics, mjx
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.state import PhysicsState
@@ -123,7 +122,7 @@ def apart(one, other):
 def on_floor(request, driver):
     """An environment on a floor of some friction, and its model in C MuJoCo, converged."""
     env, _ = driver
-    robot = dataclasses.replace(env.robot, friction=request.param)
+    robot = env.robot.model_copy(update={"friction": request.param})
     mj_model = make_mj_model(robot, env.config.physics, visual=False)
     here = env.with_model(mjx.put_model(mj_model))
     return request.param, here, converged(copy.copy(mj_model))
@@ -155,7 +154,7 @@ def test_mjx_follows_c_mujoco(driver, on_floor, robots):
     theirs = drive_in_c(reference, first, ctrl, substeps)
     distance, turned = apart(ours.qpos, theirs.qpos)
     median, p95 = np.percentile(distance, [50, 95])
-    case = f"{env.config.robot.preset}, μ = {friction}"
+    case = f"{env.robot.label}, μ = {friction}"
     print(
         f"\n{case}: MJX is within {distance.max():.3f} mm (median {median:.4f}, p95 {p95:.3f}) and"
         f" {turned.max():.3f}° of converged C MuJoCo over {STEPS} control steps"
@@ -209,8 +208,8 @@ def test_straight_driving_and_spinning_match_closed_form(driver):
     physics = drive(env, jnp.repeat(actions[:, None], STEPS, axis=1))
     velocity = np.asarray(physics.qvel[120:]).mean(axis=0)  # after the motors' run-up
     geometry = {
-        "wheel_radius": robot_model.WHEEL_RADIUS,
-        "wheel_separation": robot_model.WHEEL_SEPARATION,
+        "wheel_radius": env.robot.wheel_radius,
+        "wheel_separation": env.robot.wheel_separation,
     }
     wheels = jax.vmap(env.wheel_targets)(actions)
     expected = jax.vmap(lambda w: motion.body_twist(w, **geometry))(wheels)
@@ -218,7 +217,7 @@ def test_straight_driving_and_spinning_match_closed_form(driver):
         (STEPS - 121) * env.dt
     )
     print(
-        f"\n{env.config.robot.preset}: straight {forward:.4f} m/s of {speed},"
+        f"\n{env.robot.label}: straight {forward:.4f} m/s of {speed},"
         f" spin {velocity[1, 5]:.4f} rad/s of {expected[1, 1]:.4f},"
         f" {velocity[2, 5]:.4f} of {expected[2, 1]:.4f}"
     )
@@ -239,7 +238,7 @@ def test_straight_driving_and_spinning_match_closed_form(driver):
 )
 def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     env, drive = driver
-    robot = dataclasses.replace(env.robot, friction=friction)
+    robot = env.robot.model_copy(update={"friction": friction})
     mjx_model = mjx.put_model(make_mj_model(robot, env.config.physics, visual=False))
     rng = np.random.default_rng(1)
     actions = jnp.concatenate([held(rng, bang_bang, 64, hold) for hold in (4, 8, 16, 32)])
@@ -247,7 +246,7 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     assert np.all(np.isfinite(physics.qpos))
     assert np.all(np.isfinite(physics.qvel))
     tilt = np.degrees(jax.jit(jax.vmap(jax.vmap(motion.tilt)))(physics.qpos[:, :, 3:7]).max())
-    print(f"\n{env.config.robot.preset}, friction {friction}: worst tilt {tilt:.2f}°")
+    print(f"\n{env.robot.label}, friction {friction}: worst tilt {tilt:.2f}°")
     assert tilt < WORST_TILT
 
 

@@ -1,19 +1,16 @@
 """The compiled robot model against the published numbers of each preset."""
 
-import dataclasses
-
 import mujoco
 import numpy as np
 import pytest
 
-from jetbot_mjx.config import PhysicsConfig
-from jetbot_mjx.envs import robot_model
-from jetbot_mjx.envs.robot_model import ROBOTS, make_mj_model
+from jetbot_mjx.config import PhysicsConfig, RobotConfig
+from jetbot_mjx.envs.robot_model import make_mj_model
 
 
-@pytest.fixture(params=list(ROBOTS))
+@pytest.fixture(params=["isaac", "real"])
 def robot(request):
-    return ROBOTS[request.param]
+    return RobotConfig(preset=request.param)
 
 
 def test_the_presets_numbers_arrive_in_the_compiled_model(robot):
@@ -21,14 +18,14 @@ def test_the_presets_numbers_arrive_in_the_compiled_model(robot):
     assert (compiled.nq, compiled.nv, compiled.nu) == (9, 8, 2)
     np.testing.assert_allclose(compiled.body("jetbot").mass, robot.chassis_mass)
     np.testing.assert_allclose(compiled.body("jetbot").ipos, robot.chassis_com)
-    np.testing.assert_allclose(compiled.body("jetbot").inertia, robot.chassis_inertia)
+    np.testing.assert_allclose(compiled.body("jetbot").inertia, robot.moments_of_chassis)
     assert compiled.npair == 2 + len(robot.casters)
     for side, y in (("left", 0.057), ("right", -0.057)):
         wheel = compiled.body(f"{side}_wheel")
         np.testing.assert_allclose(wheel.mass, robot.wheel_mass)
-        np.testing.assert_allclose(wheel.inertia, robot.wheel_inertia)
+        np.testing.assert_allclose(wheel.inertia, robot.moments_of_wheel)
         np.testing.assert_allclose(wheel.pos, (0.0, y, 0.0))
-        np.testing.assert_allclose(compiled.geom(f"{side}_wheel").size[0], robot_model.WHEEL_RADIUS)
+        np.testing.assert_allclose(compiled.geom(f"{side}_wheel").size[0], robot.wheel_radius)
         np.testing.assert_allclose(compiled.joint(f"{side}_wheel_joint").damping, 0.0)
         dof = compiled.joint(f"{side}_wheel_joint").dofadr[0]
         np.testing.assert_allclose(compiled.dof_armature[dof], robot.armature)
@@ -42,16 +39,17 @@ def test_the_presets_numbers_arrive_in_the_compiled_model(robot):
         pair = compiled.pair(f"{side}_wheel")
         assert pair.dim[0] == 3
         np.testing.assert_allclose(pair.friction[:2], robot.friction)
-    for caster in robot.casters:
-        geom = compiled.geom(caster.name)
+    for i, caster in enumerate(robot.casters):
+        geom = compiled.geom(f"caster_{i}")
+        height = -0.0325 + caster.clearance + caster.radius
         np.testing.assert_allclose(geom.size[0], caster.radius)
-        np.testing.assert_allclose(geom.pos, caster.pos)
-        assert compiled.pair(caster.name).dim[0] == 1  # frictionless
+        np.testing.assert_allclose(geom.pos, (caster.x, caster.y, height))
+        assert compiled.pair(f"caster_{i}").dim[0] == 1  # frictionless
 
 
 def test_the_total_masses_are_the_published_ones():
     for name, total in (("isaac", 2.5), ("real", 0.694)):
-        compiled = make_mj_model(ROBOTS[name], PhysicsConfig())
+        compiled = make_mj_model(RobotConfig(preset=name), PhysicsConfig())
         np.testing.assert_allclose(compiled.body_mass.sum(), total)
 
 
@@ -68,7 +66,7 @@ def test_physics_options_arrive_in_the_compiled_model(robot):
 
 def test_explicit_euler_is_stable_for_the_motors(robot):
     # timestep · gain / inertia must stay below 2.
-    inertia = robot.wheel_inertia[1] + robot.armature
+    inertia = robot.moments_of_wheel[1] + robot.armature
     assert PhysicsConfig().sim_dt * robot.motor_gain / inertia < 2.0
 
 
@@ -113,11 +111,11 @@ def test_a_tasks_own_body_joins_the_scene():
         body = spec.worldbody.add_body(name="pillar", mocap=True)
         body.add_geom(size=(0.05, 0.05, 0.05))
 
-    compiled = make_mj_model(ROBOTS["isaac"], PhysicsConfig(), build_scene=build_scene)
+    compiled = make_mj_model(RobotConfig(), PhysicsConfig(), build_scene=build_scene)
     assert compiled.body("pillar").mocapid[0] == 1
 
 
 def test_friction_is_a_number_of_the_robot():
-    slippery = dataclasses.replace(ROBOTS["real"], friction=0.4)
+    slippery = RobotConfig(preset="real", friction=0.4)
     compiled = make_mj_model(slippery, PhysicsConfig())
     np.testing.assert_allclose(compiled.pair("left_wheel").friction[:2], 0.4)

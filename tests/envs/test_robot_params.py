@@ -1,6 +1,5 @@
 """Robots with changed parameters against C MuJoCo, closed-form solutions, and the preset."""
 
-import dataclasses
 import functools
 import math
 
@@ -12,15 +11,10 @@ import pytest
 
 from jetbot_mjx.config import RobotParams, parse_config
 from jetbot_mjx.devices import compiler_options
-from jetbot_mjx.envs import kinematics, mjx, robot_model
+from jetbot_mjx.envs import kinematics, mjx
 from jetbot_mjx.envs.domain_randomization import LARGEST_TRACED, DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
-from jetbot_mjx.envs.robot_model import (
-    CONTROLLER_WHEEL_RADIUS,
-    WHEEL_RADIUS,
-    WHEEL_SEPARATION,
-    make_mj_model,
-)
+from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.robot_params import vary_model
 
 ROBOTS = 16
@@ -83,13 +77,13 @@ def actions():
 
 
 def varied_robot(robot, mass, friction, shift=(0.0, 0.0, 0.0)):
-    return dataclasses.replace(
-        robot,
-        chassis_com=tuple(np.add(robot.chassis_com, shift)),
-        chassis_mass=mass * robot.chassis_mass,
-        chassis_inertia=tuple(mass * moment for moment in robot.chassis_inertia),
-        friction=friction,
-    )
+    changed = {
+        "chassis_com": tuple(np.add(robot.chassis_com, shift)),
+        "chassis_mass": mass * robot.chassis_mass,
+        "chassis_inertia": tuple(mass * moment for moment in robot.moments_of_chassis),
+        "friction": friction,
+    }
+    return robot.model_copy(update=changed)
 
 
 def drive_in_c(env, mj_model, actions, height=None):
@@ -142,7 +136,7 @@ def test_a_varied_robot_drives_as_one_compiled_with_its_numbers(driver, actions)
         for name, value in (("position", distance), ("yaw", turned), ("difference", difference)):
             worst[name] = max(worst[name], value)
     print(
-        f"\n{env.config.robot.preset}: varied robots are within {worst['position'] * 1e3:.2f} mm"
+        f"\n{env.robot.label}: varied robots are within {worst['position'] * 1e3:.2f} mm"
         f" and {math.degrees(worst['yaw']):.2f}° of C MuJoCo over {STEPS} control steps; from"
         f" their preset they are up to {worst['difference'] * 1e3:.0f} mm away"
     )
@@ -175,7 +169,7 @@ def test_the_motors_gain_scales_the_speed_and_its_limit(driver):
 
 
 def test_unequal_wheels_drive_in_the_circle_that_kinematics_predicts(driver):
-    _, drive = driver
+    env, drive = driver
     mismatch = np.concatenate([np.linspace(-0.1, -0.02, 8), np.linspace(0.02, 0.1, 8)])
     # Slow: the faster a curve, the more its centrifugal force turns the robot further in.
     physics, _ = drive(many(wheel_radius_mismatch=mismatch), straight(STEPS, -0.9))
@@ -183,10 +177,10 @@ def test_unequal_wheels_drive_in_the_circle_that_kinematics_predicts(driver):
     speed, yaw_rate = qvel[:, 120:, :2], qvel[:, 120:, 5].mean(axis=1)
     radius = np.linalg.norm(speed, axis=-1).mean(axis=1) / yaw_rate
     # v / ω = b (ω_R + ω_L) / 2 (ω_R - ω_L): a larger left wheel drives to the right.
-    np.testing.assert_allclose(radius, -WHEEL_SEPARATION / mismatch, rtol=0.02)
+    np.testing.assert_allclose(radius, -env.robot.wheel_separation / mismatch, rtol=0.02)
 
 
-def test_wheels_of_another_size_and_distance_drive_as_a_robot_built_so(driver, monkeypatch):
+def test_wheels_of_another_size_and_distance_drive_as_a_robot_built_so(driver):
     env, drive = driver
     radius, separation = 1.04, 0.95
     # Slow, as above.
@@ -195,19 +189,17 @@ def test_wheels_of_another_size_and_distance_drive_as_a_robot_built_so(driver, m
         np.asarray(drive(one, actions)[0].qpos)[0]
         for one in (many(wheel_radius=radius, wheel_separation=separation), many())
     )
-    monkeypatch.setattr(robot_model, "WHEEL_RADIUS", radius * WHEEL_RADIUS)
-    monkeypatch.setattr(robot_model, "WHEEL_SEPARATION", separation * WHEEL_SEPARATION)
-    # The casters keep their height over the floor.
-    casters = tuple(
-        dataclasses.replace(one, pos=(*one.pos[:2], one.pos[2] - (radius - 1.0) * WHEEL_RADIUS))
-        for one in env.robot.casters
-    )
-    built = make_mj_model(dataclasses.replace(env.robot, casters=casters), env.config.physics)
+    changed = {
+        "wheel_radius": radius * env.robot.wheel_radius,
+        "wheel_separation": separation * env.robot.wheel_separation,
+        "wheel_inertia": env.robot.moments_of_wheel,
+    }
+    built = make_mj_model(env.robot.model_copy(update=changed), env.config.physics)
     expected = drive_in_c(env, built, actions[0], height=built.qpos0[2])
     away = np.linalg.norm(expected[:, :2] - entered[:, :2], axis=-1).max()
     difference = np.linalg.norm(expected[:, :2] - preset[:, :2], axis=-1).max()
     print(
-        f"\n{env.config.robot.preset}: entered as wheel speeds, {away * 1e3:.1f} mm from a robot"
+        f"\n{env.robot.label}: entered as wheel speeds, {away * 1e3:.1f} mm from a robot"
         f" built so; the preset is {difference * 1e3:.0f} mm away"
     )
     assert away < 5e-3
@@ -230,7 +222,7 @@ def test_a_delay_shifts_the_response_by_its_steps(driver, actions):
 def test_a_limit_of_the_motors_lies_ahead_of_their_lag(driver):
     env, drive = driver
     _, targets = drive(many(motor_lag=0.1), straight(STEPS, 1.0))
-    speed = env.robot.max_wheel_speed or 1.0 / CONTROLLER_WHEEL_RADIUS
+    speed = env.robot.max_wheel_speed or 1.0 / env.robot.controller_wheel_radius
     expected = speed * (1.0 - np.exp(-np.arange(1, STEPS + 1) * env.dt / 0.1))
     np.testing.assert_allclose(targets[0, :, 0], expected, rtol=1e-4)
 

@@ -8,9 +8,11 @@ from pathlib import Path
 from helpers.command_modules import evaluate, render, train, tune
 from jetbot_mjx import (
     check_env,
+    check_robot,
     export,
     list_configs,
     list_runs,
+    new_robot,
     new_task,
     plan,
     play,
@@ -57,6 +59,8 @@ KEYWORDS = {"until", "do", "done", "while", "if", "then", "fi"}
 COMMANDS = {
     "new_task": new_task,
     "check_env": check_env,
+    "new_robot": new_robot,
+    "check_robot": check_robot,
     "plan": plan,
     "train": train,
     "evaluate": evaluate,

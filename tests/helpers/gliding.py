@@ -14,18 +14,14 @@ import jax.numpy as jnp
 
 from helpers import motion
 from jetbot_mjx import cli
+from jetbot_mjx.config import RobotConfig
 from jetbot_mjx.envs import kinematics, program_key
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mujoco_simulator import MujocoPhysics
 from jetbot_mjx.envs.physics import Physics
-from jetbot_mjx.envs.robot_model import (
-    CONTROLLER_WHEEL_RADIUS,
-    CONTROLLER_WHEEL_SEPARATION,
-    QPOS_QUAT,
-    QPOS_XYZ,
-    QVEL_ANGULAR_B,
-    QVEL_LINEAR_W,
-)
+from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ, QVEL_ANGULAR_B, QVEL_LINEAR_W
+
+ISAAC = RobotConfig(preset="isaac")
 
 LAG = 0.1  # [s] of the motors, so that there is something to learn
 
@@ -35,8 +31,8 @@ class GlidingPhysics(Physics):
         dt = self._config.ctrl_dt
         wanted = motion.body_twist(
             ctrl,
-            wheel_radius=CONTROLLER_WHEEL_RADIUS,
-            wheel_separation=CONTROLLER_WHEEL_SEPARATION,
+            wheel_radius=ISAAC.controller_wheel_radius,
+            wheel_separation=ISAAC.controller_wheel_separation,
         )
         heading = kinematics.yaw(state.qpos[QPOS_QUAT])
         ahead_w = jnp.stack([jnp.cos(heading), jnp.sin(heading), 0.0])

@@ -528,7 +528,9 @@ def check_arguments(command, arguments, monkeypatch):
         command.main(arguments)
     options = vars(asked.value.args[0])
     if "overrides" in options:
-        make_sense = load_config(options["config"] or "configs/jetbot.yaml", options["overrides"])
+        make_sense = load_config(
+            options.get("config") or "configs/jetbot.yaml", options["overrides"]
+        )
         assert make_sense.of_each_seed()
 
 

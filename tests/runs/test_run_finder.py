@@ -112,7 +112,7 @@ HARMS = {
     "open": (lambda path: path.write_text("seed: [\n"), "line 2 is not valid YAML"),
     "empty": (config_cut(0), "config.yaml is empty"),
     "one character": (config_cut(1), "was cut off: its last line is not complete"),
-    "half": (config_cut(700), "was cut off: its last line is not complete"),
+    "half": (config_cut(702), "was cut off: its last line is not complete"),
     "whole lines": (config_cut(-30), "was cut off: it has no section evaluation"),
     "before the last section": (config_cut(-3), "was cut off: it has no section evaluation"),
     "aliases": (lambda path: path.write_text(LAUGHS), "aliases stand for more than 100,000"),

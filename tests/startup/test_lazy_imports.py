@@ -124,6 +124,8 @@ MISTYPED = {
     "runs": ["--all"],
     "new-task": [],
     "check-env": [],
+    "new-robot": [],
+    "check-robot": [],
     "plan": [],
     "tune": ["smoke"],
     "export": ["runs/mine", "--format", "torch"],

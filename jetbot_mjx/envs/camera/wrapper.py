@@ -39,7 +39,7 @@ class _Seen(Protocol):
 
     def reset(self, rng: UInt32[Array, "2"]) -> State: ...
 
-    def step(self, state: State, action: Float[Array, "2"]) -> State: ...
+    def step(self, state: State, action: Float[Array, " action"]) -> State: ...
 
 
 def see(
@@ -143,7 +143,7 @@ class CameraWrapper(Wrapper):
         """
         return see(self.camera, self.env.task, self.env.reset(rng))
 
-    def step(self, state: State, action: Float[Array, "2"]) -> State:
+    def step(self, state: State, action: Float[Array, " action"]) -> State:
         """Make one step and render the image after it.
 
         Args:
@@ -153,7 +153,7 @@ class CameraWrapper(Wrapper):
         nstate = self.env.step(state.replace(obs=numbers_of(state.obs)), action)
         return see(self.camera, self.env.task, nstate, state.obs[PIXELS], nstate.done > 0)
 
-    def step_packed(self, packed: Packed, action: Float[Array, "2"]) -> Packed:
+    def step_packed(self, packed: Packed, action: Float[Array, " action"]) -> Packed:
         """Make one step of a packed state.
 
         Args:

@@ -131,7 +131,9 @@ class TaskProbe:
         """Return one transition in which the robot stands still."""
         quat = jnp.array([1.0, 0.0, 0.0, 0.0])
         robot = RobotState(jnp.array([0.1, 0.2, _AXLE_HEIGHT]), quat, *jnp.zeros((2, 3)))
-        return Transition(robot, robot, self.task.sample(first_key()), jnp.zeros(2))
+        return Transition(
+            robot, robot, self.task.sample(first_key()), jnp.zeros(self.config.robot.action_size)
+        )
 
     @functools.cached_property
     def transitions(self) -> dict[str, Transition]:
@@ -157,7 +159,8 @@ class TaskProbe:
         before = robots(on_floor(position), level)
         after = robots(on_floor(position + normal(0.01)), level, 0.5)
         at_goal = robots(on_floor(goal_w), level)
-        action = jnp.asarray(random.choice([-1.0, 0.0, 1.0], (DRAWS, 2)), jnp.float32)
+        shape = DRAWS, self.config.robot.action_size
+        action = jnp.asarray(random.choice([-1.0, 0.0, 1.0], shape), jnp.float32)
         steps = {
             "at the start": (start, start, action),
             "anywhere on the floor": (before, after, action),

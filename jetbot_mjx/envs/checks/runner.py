@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs import mjx
@@ -22,7 +23,7 @@ from jetbot_mjx.envs.checks.probe import (
     first_key,
 )
 from jetbot_mjx.envs.jetbot_env import make_env
-from jetbot_mjx.envs.robot_model import ROBOTS, make_mj_model, mocap_ids
+from jetbot_mjx.envs.robot_model import make_mj_model, mocap_ids
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.task import Task, layout_size, make_task
 from jetbot_mjx.envs.wrappers import wrap_for_training
@@ -108,8 +109,9 @@ def _scene(probe: TaskProbe) -> Iterator[str]:
     placed = set(task.markers(probe.example.goal))
 
     def build(*, visual: bool) -> mujoco.MjModel:
-        robot = ROBOTS[config.robot.preset]
-        return make_mj_model(robot, config.physics, build_scene=task.build_scene, visual=visual)
+        return make_mj_model(
+            config.robot, config.physics, build_scene=task.build_scene, visual=visual
+        )
 
     try:
         model, solid = build(visual=True), build(visual=False)
@@ -155,7 +157,8 @@ def _touching(probe: TaskProbe, solid: mujoco.MjModel) -> Iterator[str]:
         mujoco.mj_forward(solid, data)
         pairs = data.contact.geom[data.contact.dist < 0]
         touched.update({solid.geom(geom).name for pair in pairs for geom in pair})
-    robot_geoms = {"floor", "left_wheel", "right_wheel", "caster_front", "caster_rear"}
+    of_robot = solid.body_rootid[solid.geom_bodyid] == solid.jnt_bodyid[0]
+    robot_geoms = {"floor", *(solid.geom(geom).name for geom in np.flatnonzero(of_robot))}
     for name, often in sorted(touched.items()):
         if name not in robot_geoms:
             yield (
@@ -169,7 +172,7 @@ def _drive(probe: TaskProbe) -> Iterator[str]:
     # Compare the trees of the states before and after a step.
     env = make_env(probe.config)
     first = jax.eval_shape(env.reset, first_key())
-    second = jax.eval_shape(env.step, first, jax.eval_shape(lambda: jnp.zeros(2)))
+    second = jax.eval_shape(env.step, first, jax.eval_shape(lambda: jnp.zeros(env.action_size)))
     if unlike := _changed(first, second):
         yield f"a step changes the state's {unlike}: keep names, tree, shapes and dtypes"
         return
@@ -183,7 +186,7 @@ def _drive(probe: TaskProbe) -> Iterator[str]:
         return batch.step(state, action)
 
     keys = jax.random.split(first_key(), DRIVE_ENVS)
-    actions = jax.random.uniform(keys[0], (DRIVE_STEPS, DRIVE_ENVS, 2), minval=-1.0)
+    actions = jax.random.uniform(keys[0], (DRIVE_STEPS, DRIVE_ENVS, env.action_size), minval=-1.0)
     # Half of the robots get the largest actions.
     actions = jnp.where(jnp.arange(DRIVE_ENVS)[:, None] % 2, actions, jnp.sign(actions))
     state = jax.jit(batch.reset)(keys)

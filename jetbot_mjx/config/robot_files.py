@@ -1,0 +1,114 @@
+"""Keep the files of robots' models, by their hash.
+
+A configuration names a model without its folder, and holds the hash of all files that it consists
+of. So it means the same model wherever it is: beside the user's own configuration, in a run folder,
+which has copies of the files, and after the user has changed them.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+
+from jetbot_mjx.config.errors import ConfigError, ConfigNotFoundError
+
+FOLDER = "robot"
+"""Folder of a run that holds the files of its robot's model."""
+
+MAX_BYTES = 20_000_000
+"""Largest size of all files of a model together."""
+
+_MODELS: dict[str, Mapping[str, bytes]] = {}
+"""Files of each model that this process has read, by their hash."""
+
+_FOLDERS = {"mesh": "meshdir", "texture": "texturedir", "hfield": "meshdir", "skin": "meshdir"}
+"""Attributes of MJCF's `compiler` that name the folders of elements."""
+
+
+def register(path: Path, code: str | None = None) -> str:
+    """Read a model with all files that it names: those that it includes, meshes and textures.
+
+    Args:
+      path: an MJCF.
+      code: name of a Python file beside it that belongs to it; None: there is none.
+
+    Returns:
+      The hash of its files.
+
+    Raises:
+      ConfigError: a file cannot be read, is outside of the model's folder, or is not an MJCF; or
+        there are more than `MAX_BYTES`.
+    """
+    files: dict[str, bytes] = {}
+    _collect(path, path.parent, files)
+    if code is not None:
+        _read(path.parent / code, path.parent, files)
+    if (size := sum(map(len, files.values()))) > MAX_BYTES:
+        raise ConfigError(
+            f"robot.file {path}: its files have {size:,} bytes, more than {MAX_BYTES:,}: leave out"
+            " what only shows"
+        )
+    digest = hashlib.sha256(path.name.encode())
+    for name, content in sorted(files.items()):
+        digest.update(f"{name}\0{len(content)}\0".encode() + content)
+    _MODELS[digest.hexdigest()] = files
+    return digest.hexdigest()
+
+
+def model_files(digest: str) -> Mapping[str, bytes] | None:
+    """Return the files of a model.
+
+    Args:
+      digest: the hash of its files, as of `register`.
+
+    Returns:
+      The content of each file by its path from the model's folder; None if this process has not
+      read the model.
+    """
+    return _MODELS.get(digest)
+
+
+def _collect(path: Path, root: Path, files: dict[str, bytes]) -> None:
+    """Add a model's file and those that it names."""
+    before = len(files)
+    text = _read(path, root, files)
+    if len(files) == before:
+        return
+    try:
+        tree = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ConfigError(f"robot.file {path}: this is not XML: {error}") from None
+    if tree.tag not in ("mujoco", "mujocoinclude"):
+        raise ConfigError(
+            f"robot.file {path}: <{tree.tag}> is not a MuJoCo model: its root should be <mujoco>"
+        )
+    folders = {}
+    for compiler in tree.iter("compiler"):
+        folders |= compiler.attrib
+    for element in tree.iter():
+        name = element.get("file")
+        if name is None:
+            continue
+        if element.tag == "include":
+            _collect(root / name, root, files)
+        elif element.tag in _FOLDERS:
+            folder = folders.get(_FOLDERS[element.tag], folders.get("assetdir", ""))
+            _read(root / folder / name, root, files)
+
+
+def _read(path: Path, root: Path, files: dict[str, bytes]) -> bytes:
+    """Read one file, and add it."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise ConfigNotFoundError(f"robot.file {path} does not exist") from None
+    except OSError as error:
+        raise ConfigError(f"robot.file {path} cannot be read: {error.strerror}") from None
+    try:
+        name = path.resolve().relative_to(root.resolve()).as_posix()
+    except ValueError:
+        raise ConfigError(
+            f"robot.file: {path} is outside of the model's folder, {root}: a run stores that folder"
+        ) from None
+    files[name] = content
+    return content

@@ -1,0 +1,54 @@
+"""`check_robot` tells what a robot is, how it follows its commands, and what is wrong with it."""
+
+import pytest
+
+from helpers.own_robots import EXAMPLES, copy_robot
+from jetbot_mjx import check_robot
+from jetbot_mjx.errors import UserError
+
+
+@pytest.fixture
+def checked(monkeypatch, capsys):
+    """What it prints for a file; what a step costs is printed by `onekernel.explain`."""
+    monkeypatch.setattr(check_robot, "_tell_cost", lambda env: None)
+
+    def check(*arguments):
+        assert check_robot.main([*map(str, arguments)]) == 0
+        return capsys.readouterr().out
+
+    return check
+
+
+def test_a_configuration_is_checked_with_its_settings(checked):
+    printed = checked(EXAMPLES / "rover.yaml", "--set", "robot.wheel_separation=0.2")
+    assert "rover: 3.2 kg" in printed
+    assert "0.79 m/s of task.max_speed = 0.8" in printed
+    assert "wheels of 50 mm, 200 mm apart for the controller" in printed
+    assert "would make that 100 %" in printed
+
+
+def test_of_a_model_alone_the_parts_are_guessed_and_printed(checked):
+    printed = checked(EXAMPLES / "car.xml")
+    assert '"drive": "ackermann", "steering": {"left": ["steer_left"]' in printed
+    assert "turn       circles of 0.2" in printed
+
+
+def test_measures_are_checked(checked, root):
+    printed = checked(root / "jetbot_mjx" / "assets" / "robots" / "real.yaml")
+    assert "real: 0.694 kg" in printed
+
+
+def test_what_a_step_costs_is_told(capsys):
+    assert check_robot.main([str(EXAMPLES / "turtlebot.yaml")]) == 0
+    printed = capsys.readouterr().out
+    assert "step_of_this_robot is one kernel" in printed
+    assert "environment steps/s of 1,024 robots on this" in printed
+
+
+def test_what_is_wrong_is_told(checked, tmp_path):
+    config = copy_robot(tmp_path, "turtlebot", [("<freejoint/>", "")])
+    with pytest.raises(UserError, match="no body of the world has a free joint"):
+        checked(config)
+    (tmp_path / "ball.xml").write_text("<mujoco><worldbody/></mujoco>")
+    with pytest.raises(UserError, match="no actuators turn wheels on both sides"):
+        checked(tmp_path / "ball.xml")

@@ -1,0 +1,67 @@
+"""The files of a robot's model: which they are, their hash, and what is refused."""
+
+import pytest
+
+from jetbot_mjx.config import ConfigError, robot_files
+from jetbot_mjx.config.robot_files import model_files, register
+
+MODEL = """
+<mujoco><compiler meshdir="m" texturedir="t"/><include file="parts.xml"/>
+<asset><mesh name="a" file="a.stl"/><texture name="b" type="2d" file="b.png"/></asset></mujoco>
+"""
+PARTS = '<mujocoinclude><asset><mesh name="c" file="c.stl"/></asset></mujocoinclude>'
+
+
+@pytest.fixture
+def model(tmp_path):
+    for name in ("m/a.stl", "m/c.stl", "t/b.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(name.encode())
+    (tmp_path / "parts.xml").write_text(PARTS.replace("c.stl", "m/c.stl"))
+    (tmp_path / "model.xml").write_text(MODEL)
+    return tmp_path / "model.xml"
+
+
+def test_all_files_that_a_model_names_belong_to_it(model):
+    files = model_files(register(model))
+    assert set(files) == {"model.xml", "parts.xml", "m/a.stl", "m/c.stl", "t/b.png"}
+    assert files["m/a.stl"] == b"m/a.stl"
+
+
+def test_the_hash_is_of_all_of_them(model):
+    first = register(model)
+    assert register(model) == first
+    (model.parent / "m" / "a.stl").write_bytes(b"another")
+    assert register(model) != first
+    # What a configuration was loaded with stays what it was.
+    assert model_files(first)["m/a.stl"] == b"m/a.stl"
+    assert model_files("0" * 64) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('<mujoco><include file="../other.xml"/></mujoco>', "outside of the model's folder"),
+        ('<mujoco><include file="none.xml"/></mujoco>', "none.xml does not exist"),
+        ("<robot/>", "<robot> is not a MuJoCo model: its root should be <mujoco>"),
+        ("<mujoco>", "this is not XML: no element found"),
+    ],
+)
+def test_what_is_no_model_is_refused_in_one_line(model, text, said):
+    (model.parent.parent / "other.xml").write_text("<mujoco/>")
+    model.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        register(model)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_model_that_includes_itself_ends(model):
+    model.write_text('<mujoco><include file="model.xml"/></mujoco>')
+    assert set(model_files(register(model))) == {"model.xml"}
+
+
+def test_large_models_are_refused(model, monkeypatch):
+    monkeypatch.setattr(robot_files, "MAX_BYTES", 100)
+    with pytest.raises(ConfigError, match="more than 100: leave out what only shows"):
+        register(model)

@@ -1,0 +1,61 @@
+"""The section `robot` of a model of one's own."""
+
+import pytest
+
+from helpers.own_robots import copy_robot, load_robot
+from jetbot_mjx.config import ConfigError, MjcfRobotConfig, load_config, parse_config
+
+ROVER = {"wheels": {"left": ["fl", "rl"], "right": ["fr", "rr"]}}
+
+
+def test_it_is_found_beside_the_configuration_and_known_by_its_hash(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "in").mkdir()
+    robot = load_config(copy_robot(tmp_path / "in", "rover")).robot
+    assert isinstance(robot, MjcfRobotConfig)
+    assert (robot.file, robot.label, robot.drive) == ("rover.xml", "rover", "differential")
+    assert robot == load_robot("rover").robot
+    changed = load_config(copy_robot(tmp_path / "in", "rover", [("0.085", "0.086")])).robot
+    assert changed.sha256 != robot.sha256
+
+
+def test_settings_of_it_can_be_changed_and_it_can_be_replaced():
+    config = load_robot("rover", "robot.wheel_separation=0.3")
+    assert config.robot.wheel_separation == 0.3
+    assert load_config(config, ["robot.wheel_separation=0.4"]).robot.wheel_separation == 0.4
+    assert parse_config(config.model_dump(mode="json")) == config
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"wheels": {"left": [], "right": ["fr"]}}, "robot.wheels.left = [] is wrong: it should"),
+        ({"wheels": None}, "wheels = None do not fit: a function moves"),
+        (
+            {"drive": "tank"},
+            "robot.drive: 'tank' is no drive: it should be differential, ackermann, or",
+        ),
+        ({"wheel_radius": 50}, "robot.wheel_radius = 50 is wrong"),
+        (
+            {"chassis_mass": 2.0},
+            "robot.chassis_mass = 2.0 is unknown: a robot with a model of its own has file, base",
+        ),
+        ({"steering": ROVER["wheels"]}, "do not fit: a car has both"),
+        ({"file": "none.xml"}, "robot.file none.xml does not exist"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(changed, said):
+    values = load_robot("rover").model_dump(mode="json")["robot"]
+    if "file" in changed:
+        values["sha256"] = ""
+    with pytest.raises(ConfigError) as error:
+        parse_config({"robot": values | changed})
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_what_a_car_does_not_have_is_not_drawn():
+    load_robot("rover", "randomization.motor_lag=[0, 0.1]")
+    load_robot("car", "randomization.friction=[0.5, 1]")
+    with pytest.raises(ConfigError, match=r"randomization.motor_lag is of motors on two sides"):
+        load_robot("car", "randomization.motor_lag=[0, 0.1]")

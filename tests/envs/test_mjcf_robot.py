@@ -1,0 +1,238 @@
+"""Robots that are MuJoCo models of their own: their scene, their wheels, and what is refused."""
+
+import copy
+import json
+import types
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from helpers.broken_robots import BROKEN
+from helpers.own_robots import EXAMPLES, OWN_ROBOTS, copy_robot, load_robot
+from jetbot_mjx.config import MjcfRobotConfig, load_config, model_files, parse_config
+from jetbot_mjx.envs import make_env
+from jetbot_mjx.envs.mjcf_robot import guess_section
+from jetbot_mjx.envs.robot_model import robot_body
+from jetbot_mjx.errors import UserError
+
+HOLD = 16
+"""Environment steps for which a command of the drives is held."""
+
+
+@pytest.fixture(scope="module")
+def env_of():
+    envs = {name: make_env(load_robot(name)) for name in OWN_ROBOTS}
+    return envs.get
+
+
+@pytest.mark.parametrize("name", OWN_ROBOTS)
+def test_the_robot_stands_in_the_scene_and_looks_ahead(env_of, name):
+    env = env_of(name)
+    model = env.mj_model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert robot_body(model).startswith("robot/")
+    np.testing.assert_allclose(model.qpos0[:2], 0.0)
+    assert {model.camera(i).name for i in range(model.ncam)} >= {"chase", "onboard", "top"}
+    ahead = -data.cam_xmat[model.camera("chase").id].reshape(3, 3)[:, 2]
+    assert ahead[0] > 0.8
+    assert data.cam_xpos[model.camera("chase").id][0] < -0.5
+    # Only what touches takes part in physics.
+    assert env.physics.mj_model.ngeom < model.ngeom
+    assert env.physics.mj_model.ncam == 0
+
+
+def test_the_wheels_are_found_with_their_places(env_of):
+    rover = env_of("rover").drive
+    assert rover.wheel_radius == pytest.approx(0.05)
+    assert rover.wheel_separation == 0.45
+    places = [(one.actuator, round(one.x, 4), round(one.y, 4)) for one in rover.wheels]
+    assert places == [(0, 0.085, 0.1), (1, 0.085, -0.1), (2, -0.085, 0.1), (3, -0.085, -0.1)]
+    car = env_of("car").drive
+    assert car.rear == pytest.approx(0.0)
+    assert [round(one.x, 4) for one in car.steered] == [0.16, 0.16]
+    # At the largest curvature the inner wheel is at its limit.
+    controls = np.asarray(car.controls(jnp.array([0.0, car.max_curvature])))
+    assert np.abs(controls[2:]).max() == pytest.approx(0.7, rel=1e-5)
+
+
+@pytest.mark.parametrize(("axis", "y", "gain"), [("0 -1 0", 0.08, -1.0), ("0 1 0", 0.08, 1.0)])
+def test_a_wheel_that_turns_the_other_way_gets_the_other_sign(tmp_path, axis, y, gain):
+    changes = [('name="left_wheel" axis="0 1 0"', f'name="left_wheel" axis="{axis}"')]
+    env = make_env(load_config(copy_robot(tmp_path, "turtlebot", changes)))
+    left = env.drive.wheels[0]
+    assert (left.y, left.gain) == (pytest.approx(y), gain)
+
+
+def test_a_gear_is_part_of_the_control(tmp_path):
+    changes = [('kv="0.08" forcerange="-0.2 0.2"', 'kv="0.0008" gear="10" forcerange="-0.02 0.02"')]
+    env = make_env(load_config(copy_robot(tmp_path, "turtlebot", changes)))
+    assert [one.gain for one in env.drive.wheels] == [10.0, 10.0]
+
+
+@pytest.mark.parametrize("broken", BROKEN.values(), ids=list(BROKEN))
+def test_a_broken_robot_gets_one_clear_line(tmp_path, monkeypatch, broken, capfd):
+    config = copy_robot(tmp_path, broken.robot, broken.changes, broken.settings)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError) as error:
+        make_env(load_config(config))
+    assert broken.said in str(error.value)
+    assert "\n" not in str(error.value)
+    assert capfd.readouterr() == ("", "")
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_a_model_that_this_process_has_not_read_is_asked_for():
+    values = load_robot("rover").model_dump(mode="json")
+    values["robot"]["sha256"] = "0" * 64
+    with pytest.raises(UserError, match="load a configuration that names its file"):
+        make_env(parse_config(values))
+
+
+def test_parts_are_guessed_by_their_axes_and_sides():
+    for name in OWN_ROBOTS:
+        robot = load_robot(name).robot
+        assert isinstance(robot, MjcfRobotConfig)
+        files = model_files(robot.sha256)
+        section = guess_section(robot.file, files[robot.file].decode(), files)
+        given = robot.model_dump(mode="json", exclude_defaults=True, exclude={"sha256"})
+        given.pop("wheel_separation", None)
+        assert section == given
+    assert guess_section("x.xml", "<mujoco/>", {}) == {}
+    assert guess_section("x.xml", "<mujoco><body/></mujoco>", {}) == {}
+
+
+def drive_both_ways(env, robots, seconds):
+    """Positions [m] of robots after commands at the limits, in MJX and in converged C MuJoCo."""
+    count = round(seconds / env.dt)
+    rng = np.random.default_rng(0)
+    drawn = rng.choice([-1.0, 1.0], (robots, count // HOLD + 1, 2))
+    actions = jnp.asarray(np.repeat(drawn, HOLD, axis=1)[:, :count], jnp.float32)
+    ctrl = jax.vmap(jax.vmap(lambda x: env.drive.controls(env.wheel_targets(x))))(actions)
+    keys = jax.random.split(jax.random.PRNGKey(0), robots)
+
+    def drive(ctrl):
+        first = jax.vmap(env.reset)(keys).pipeline_state
+        step = jax.vmap(env.physics.step)
+        return jax.lax.scan(lambda x, u: (step(x, u), None), first, ctrl.swapaxes(0, 1))[0]
+
+    ours = np.asarray(jax.jit(drive)(ctrl).qpos)[:, :3]
+    model = copy.copy(env.physics.mj_model)
+    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
+
+    def in_c(controls, push):
+        data = mujoco.MjData(model)
+        data.qvel[0] = push
+        for control in controls:
+            data.ctrl[:] = control
+            mujoco.mj_step(model, data, nstep=env.config.physics.n_substeps)
+        return data.qpos[:3].copy()
+
+    controls = np.asarray(ctrl, float)
+    theirs, pushed = (np.stack([in_c(one, push) for one in controls]) for push in (0.0, 1e-6))
+    apart = np.linalg.norm(ours - theirs, axis=1)
+    return apart, np.linalg.norm(pushed - theirs, axis=1), theirs
+
+
+@pytest.mark.parametrize("name", OWN_ROBOTS)
+def test_it_drives_as_in_converged_c_mujoco(env_of, name):
+    apart, _, places = drive_both_ways(env_of(name), 8, 1.0)
+    assert np.median(apart) < 5e-6
+    assert np.median(np.linalg.norm(places[:, :2], axis=1)) > 0.1  # and it did drive
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OWN_ROBOTS)
+def test_a_hundred_of_them_stay_together_for_four_seconds(env_of, name):
+    apart, pushed, _ = drive_both_ways(env_of(name), 128, 4.0)
+    print(f"\n{name}: median {1e3 * np.median(apart):.4f} mm, largest {1e3 * apart.max():.3f} mm")
+    assert np.median(apart) < 5e-5
+    # One that is further away is as sensitive to a push of 1e-6 m/s in C MuJoCo itself.
+    explained = (apart < 2e-3) | (pushed > 0.1 * apart)
+    assert explained.all()
+    assert (apart < 2e-3).mean() >= 0.99
+
+
+OWN_DRIVE = """
+import jax.numpy as jnp
+
+
+def controls(action):
+    # A number for each wheel: front left, front right, rear left, rear right.
+    return 10.0 * action
+"""
+
+
+@pytest.fixture
+def own_drive(tmp_path):
+    """The configuration of a rover whose action has a number for each wheel."""
+    (tmp_path / "wheels.py").write_text(OWN_DRIVE)
+    own = {"drive": "wheels.py:controls", "action_size": 4, "wheels": None}
+    own["wheel_separation"] = None
+    return copy_robot(tmp_path, "rover", settings=own)
+
+
+def test_an_own_function_drives_all_actuators(own_drive):
+    env = make_env(load_config(own_drive))
+    assert env.action_size == 4
+    state = env.reset(jax.random.PRNGKey(0))
+    state = jax.jit(env.step)(state, jnp.array([1.0, -1.0, 1.0, -3.0]))
+    assert state.pipeline_state.qvel[5] < 0.0  # it turns to the right
+    np.testing.assert_array_equal(env.action_of_twist(jnp.zeros(2)), [-1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("def controls(action): return action[:3]", "returns the shape [3]: the model has 4"),
+        ("def control(action): return action", "AttributeError: module 'wheels' has no attribute"),
+        ("import nothing_like_it", "ModuleNotFoundError: No module named 'nothing_like_it'"),
+        ("def controls(action): return 1e6 * action", "unstable with physics.sim_dt"),
+    ],
+)
+def test_an_own_function_that_does_not_fit_gets_one_line(own_drive, code, said):
+    (own_drive.parent / "wheels.py").write_text(code)
+    changes = [('forcerange="-1.2 1.2"', "")] if "1e6" in code else []
+    own = {"drive": "wheels.py:controls", "action_size": 4, "wheels": None}
+    own_drive = copy_robot(own_drive.parent, "rover", changes, own)
+    with pytest.raises(UserError) as error:
+        make_env(load_config(own_drive))
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        ({"drive": "wheels.py"}, "'wheels.py' is no drive: it should be differential, ackermann"),
+        ({"drive": "tank"}, "'tank' is no drive"),
+        ({"drive": "none.py:f", "wheels": None}, "none.py does not exist"),
+        ({"drive": "wheels.py:controls"}, "a function moves all actuators by itself"),
+        ({"wheels": None}, "another drive needs wheels"),
+        ({"action_size": 3}, "action_size = 3: that of differential is 2"),
+    ],
+)
+def test_drives_that_do_not_fit_their_settings_get_one_line(own_drive, own, said):
+    config = copy_robot(own_drive.parent, "rover", settings=own)
+    with pytest.raises(UserError) as error:
+        load_config(config)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", OWN_ROBOTS)
+def test_the_exported_policies_of_the_examples_are_of_these_robots(name):
+    folder = EXAMPLES / "policies" / name
+    spec = json.loads((folder / "policy.json").read_text("utf-8"))
+    robot = load_robot(name).robot
+    assert spec["robot"] == robot.model_dump(mode="json")
+    module = types.ModuleType(name)
+    exec((folder / "policy.py").read_text("utf-8"), module.__dict__)
+    # It turns to goals half a metre to the left and to the right.
+    for side in (1.0, -1.0):
+        seen = np.array([0.0, 0.5 * side, 0.0, side, 0.5, 0.1, 0.0], np.float32)
+        action, _ = module.act(seen)
+        assert side * action[1] > 0.3
