@@ -29,7 +29,16 @@ def assert_same_policy(*runs):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.fixture(scope="module", params=["measures", "car", "own drive"])
+# A car has all that a JetBot has not; the others are shown to end the same way by the slow tests.
+QUICK, SLOW = ("car",), ("measures", "own drive")
+every_kind = pytest.mark.parametrize(
+    "trained",
+    [*QUICK, *(pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW)],
+    indirect=True,
+)
+
+
+@pytest.fixture(scope="module")
 def trained(request, tmp_path_factory):
     """A run, and the folder that its files came from, which are gone."""
     folder = tmp_path_factory.mktemp("own")
@@ -50,6 +59,7 @@ def trained(request, tmp_path_factory):
         yield folder / "run"
 
 
+@every_kind
 def test_the_run_holds_what_the_robot_is(trained):
     config = stored_config(trained)
     assert load_checkpoint(trained).config.robot == config.robot
@@ -59,6 +69,7 @@ def test_the_run_holds_what_the_robot_is(trained):
         assert (config.robot.wheel_radius, config.robot.friction) == (0.04, 1.0)
 
 
+@every_kind
 def test_it_is_evaluated_in_both_simulators_rendered_and_exported(trained, tmp_path):
     evaluate(trained, episodes=4, simulator="mujoco", output=tmp_path / "report")
     assert "in C MuJoCo" in (tmp_path / "report" / "report.md").read_text()
@@ -88,6 +99,7 @@ def test_it_is_evaluated_in_both_simulators_rendered_and_exported(trained, tmp_p
         assert "actuators" not in spec
 
 
+@every_kind
 def test_a_training_that_is_continued_ends_with_the_same_bits(trained, tmp_path):
     config = stored_config(trained)
     half = load_config(config, ["ppo.num_timesteps=1024"])
@@ -96,6 +108,7 @@ def test_a_training_that_is_continued_ends_with_the_same_bits(trained, tmp_path)
     assert_same_policy(tmp_path / "run", trained)
 
 
+@every_kind
 def test_a_model_that_was_changed_in_the_run_is_refused(trained):
     config = stored_config(trained)
     if not isinstance(config.robot, MjcfRobotConfig):
