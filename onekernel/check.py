@@ -2,10 +2,10 @@
 
 Two correct programs of one function differ by round-off, and a function may enlarge that: a test
 such as x > 0.3 goes one way here and the other way there, and a solver stops an iteration earlier.
-So the measure of what is allowed comes from the function itself: XLA computes it also for arguments
-that are shaken by some units in their last place, and a result may differ from XLA's by a few times
-what the shaken ones differ by. A whole number or truth value that the shaking does not change must
-be the same.
+So the measure of what is allowed comes from the function itself: XLA computes it also with other
+round-off in each of its operations (`onekernel.round_off`), and a result may differ from XLA's by a
+few times what those evaluations differ by. A whole number or truth value that is the same in all of
+them must be the same.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,17 +16,23 @@ from jaxtyping import Array
 
 from onekernel.errors import KernelError
 from onekernel.kernel import Kernel
+from onekernel.round_off import noisy
 
 _INSTANCES = 65
-_SHAKES = 6
-_SHAKE = 4 * float(np.finfo(np.float32).eps)
-"""Largest relative change of a shaken number: 4 to 8 units in the last place."""
+_EVALUATIONS = 16
+"""Number of evaluations with other round-off."""
 
 _ROUNDING = 1e-5
 """Difference that is always allowed, as a part of the largest magnitude of a result's scalar."""
 
-_AMPLIFICATION = 8.0
-"""Multiple of the largest difference between shaken results that is allowed beside that."""
+_JUMP = 1e-3
+"""Difference of an evaluation, likewise, above which round-off has decided something there."""
+
+_REACH = 8.0
+"""Multiple of such a difference by which all numbers of its instance may differ there."""
+
+_AMPLIFICATION = 4.0
+"""Multiple of the largest difference of those evaluations that is allowed beside that."""
 
 
 def check(kernel: Kernel, arguments: Sequence[np.dtype], results: Sequence[np.dtype]) -> None:
@@ -51,11 +57,12 @@ def check(kernel: Kernel, arguments: Sequence[np.dtype], results: Sequence[np.dt
         by_xla = jax.jit(jax.vmap(lambda *passed: kernel.fallback(*passed)))
         ours = _run(jax.jit(jax.vmap(lambda *passed: kernel.as_function()(passed))), drawn, results)
         theirs = _run(by_xla, drawn, results)
-        shaken = [
-            _run(by_xla, [_shaken(random, x) for x in drawn], results) for _ in range(_SHAKES)
-        ]
+        seeds = random.integers(0, 2**32, (_EVALUATIONS, _INSTANCES), np.uint32)
+        with_noise = jax.jit(jax.vmap(noisy(kernel.fallback)))
+        shaken = [_run(with_noise, [seed, *drawn], results) for seed in seeds]
     for place, (one, other) in enumerate(zip(ours, theirs, strict=True)):
-        wrong = differ(one, other, [x[place] for x in shaken])
+        others = [x[place] for x in shaken]
+        wrong = differ(one, other, [*others, _decided(other, others)], _AMPLIFICATION)
         if wrong.any():
             # Name the first number that differs.
             at = tuple(np.argwhere(wrong)[0].tolist())
@@ -80,12 +87,6 @@ def _draw(random: np.random.Generator, dtype: np.dtype, shape: tuple[int, ...]) 
     return random.integers(0, 8, full, np.int32)
 
 
-def _shaken(random: np.random.Generator, x: np.ndarray) -> np.ndarray:
-    if x.dtype.kind != "f":
-        return x
-    return (x * (1 + _SHAKE * random.uniform(-1, 1, x.shape))).astype(np.float32)
-
-
 def _run(
     function: Callable[..., list[Array]],
     arguments: Sequence[np.ndarray],
@@ -97,27 +98,58 @@ def _run(
     return [x != 0 if dtype.kind == "b" else x for x, dtype in found]
 
 
-def differ(one: np.ndarray, other: np.ndarray, shaken: Sequence[np.ndarray]) -> np.ndarray:
+def differ(
+    one: np.ndarray, other: np.ndarray, shaken: Sequence[np.ndarray], amplification: float
+) -> np.ndarray:
     """Return which numbers differ by more than round-off.
 
     Args:
       one: a result of several instances, (instances, ...).
       other: what it should be.
-      shaken: the same as `other`, each computed from other shaken numbers.
+      shaken: the same as `other`, each computed with other round-off.
+      amplification: multiple of the largest difference between those and `other` that is allowed.
 
     Returns:
       Truth values of the shape of `one`.
     """
     if one.dtype.kind != "f":
-        # What the shaking changes may go either way.
+        # What round-off changes may go either way.
         steady = np.all([x == other for x in shaken], axis=0)
         return steady & (one != other)
     with np.errstate(invalid="ignore", over="ignore"):
         spread = np.max([np.abs(x.astype(np.float64) - other) for x in shaken], axis=0)
-        size = np.max(np.abs(np.where(np.isfinite(other), other, 0)), axis=0, initial=1e-30)
-        allowed = _ROUNDING * np.maximum(np.abs(other), 1e-3 * size) + _AMPLIFICATION * spread
+        size = np.maximum(np.abs(other), np.maximum(1e-3 * _size(other), 1e-30))
+        allowed = _ROUNDING * size + amplification * spread
         close = np.abs(one.astype(np.float64) - other) <= allowed
     same = (one == other) | (np.isnan(one) & np.isnan(other))
-    # A result that is finite in some shaken instances only is as unsteady as one that varies.
+    # A result that is finite in some evaluations only is as unsteady as one that varies.
     steady = np.all([np.isfinite(x) == np.isfinite(other) for x in shaken], axis=0)
     return steady & ~close & ~same
+
+
+def _decided(result: np.ndarray, shaken: Sequence[np.ndarray]) -> np.ndarray:
+    """Return a result that differs in all numbers of an instance in which round-off decides.
+
+    Where a comparison or an index goes one way or the other, what it changes is no measure of what
+    another such decision changes: all numbers of such an instance move farther than the farthest.
+
+    Args:
+      result: a result of several instances, (instances, ...).
+      shaken: the same, each computed with other round-off.
+    """
+    plain = result.astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        moves = np.max([np.abs(np.where(x == result, 0, x - plain)) for x in shaken], axis=0)
+        # A number that is finite in some evaluations only moves without end.
+        steady = np.all([np.isnan(x) == np.isnan(plain) for x in shaken], axis=0)
+        moves = np.where(np.isnan(moves), np.where(steady, 0, np.inf), moves)
+        limit = _JUMP * np.maximum(np.abs(plain), _size(plain)) if result.dtype.kind == "f" else 0
+        axes = tuple(range(1, result.ndim))
+        jumps = (moves > limit).any(axis=axes, keepdims=True)
+        farthest = moves.max(axis=axes, keepdims=True, initial=0)
+        return np.where(jumps, plain + _REACH * farthest, plain)
+
+
+def _size(result: np.ndarray) -> np.ndarray:
+    """Return how large each number of a result is in the median of the instances."""
+    return np.median(np.abs(np.where(np.isfinite(result), result, 0)), axis=0)

@@ -63,6 +63,18 @@ def check_bytes(count: int) -> None:
         )
 
 
+def scan_ends(equation: JaxprEqn) -> tuple[int, int]:
+    """Return where among the operands of a scan the constants end, and where the carry does."""
+    # Versions of JAX say so in parameters of other names. Inside, sequences have one axis less.
+    body = equation.params["jaxpr"].jaxpr
+    scanned, stacked = (
+        sum(len(shape_of(a)) != len(shape_of(b)) for a, b in zip(outer, inner, strict=True))
+        for outer, inner in ((equation.invars, body.invars), (equation.outvars, body.outvars))
+    )
+    last = len(equation.invars) - scanned
+    return last - (len(equation.outvars) - stacked), last
+
+
 @dataclasses.dataclass(frozen=True)
 class _Scan:
     """A `_Scan` holds a scan's body and what it is given."""
@@ -79,19 +91,9 @@ class _Scan:
     @classmethod
     def of(cls, equation: JaxprEqn, operands: Sequence[ScalarArray]) -> "_Scan":
         """Split the operands of a scan."""
-        body = equation.params["jaxpr"]
-        # Inside, sequences have one axis less than outside.
-        scanned, stacked = (
-            sum(len(shape_of(a)) != len(shape_of(b)) for a, b in zip(outer, inner, strict=True))
-            for outer, inner in (
-                (equation.invars, body.jaxpr.invars),
-                (equation.outvars, body.jaxpr.outvars),
-            )
-        )
-        last = len(operands) - scanned
-        first = last - (len(equation.outvars) - stacked)
+        first, last = scan_ends(equation)
         return cls(
-            body,
+            equation.params["jaxpr"],
             equation.params["length"],
             equation.params["reverse"],
             list(operands[:first]),

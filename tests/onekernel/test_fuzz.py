@@ -24,6 +24,9 @@ REGRESSIONS = (33, 62, 110, 236, 689, 972)
 STAGES = 5
 """Of so many functions one is also checked in each stage of the compiler."""
 
+AMPLIFICATION = 8.0
+"""Multiple of what the shaking changes that a result may differ by."""
+
 SHAKES = 6
 SHAKE = 2 * float(np.finfo(np.float32).eps)
 LANES = cpu.host_processor().lanes
@@ -73,7 +76,7 @@ def agree(function, ours, theirs, shaken, what):
     for place, (is_exact, one, other, *shakes) in enumerate(zip(exact, *columns, strict=True)):
         assert (one.shape, one.dtype) == (other.shape, other.dtype)
         assert is_exact or np.isfinite(other).all()
-        wrong = np.argwhere(one != other if is_exact else differ(one, other, shakes))
+        wrong = np.argwhere(one != other if is_exact else differ(one, other, shakes, AMPLIFICATION))
         assert not len(wrong), (
             f"{what}: leaf {place} at {wrong[0]} is {one[(*wrong[0],)]}, not {other[(*wrong[0],)]}"
         )

@@ -43,7 +43,7 @@ which are for others' programs, or `startup`, which is for commands."""
 
 ENGINE_ORDER = (
     *("errors", "background", "trusted_files", "lower", "codegen", "kernel", "cpu", "gpu"),
-    *("backends", "check", "fused", "explanation", "aot", "build"),
+    *("backends", "round_off", "check", "fused", "explanation", "aot", "build"),
     "mujoco",
 )
 """Modules and rooms of the engine: each imports only itself and those before it."""
