@@ -105,6 +105,9 @@ def test_parts_are_guessed_by_their_axes_and_sides():
     assert guess_section("x.xml", "<mujoco><body/></mujoco>", {}) == {}
 
 
+FAR = 2e-3  # [m] that few robots are apart, and by pushes C MuJoCo's own too
+
+
 def drive_both_ways(env, robots, seconds):
     """Positions [m] of robots after commands at the limits, in MJX and in converged C MuJoCo."""
     count = round(seconds / env.dt)
@@ -123,18 +126,23 @@ def drive_both_ways(env, robots, seconds):
     model = copy.copy(env.physics.mj_model)
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
 
-    def in_c(controls, push):
-        data = mujoco.MjData(model)
-        data.qvel[0] = push
+    def in_c(controls, push=0.0, seed=0):
+        data, rng = mujoco.MjData(model), np.random.default_rng(seed)
         for control in controls:
+            data.qvel[:] += push * rng.choice([-1.0, 1.0], model.nv)
             data.ctrl[:] = control
             mujoco.mj_step(model, data, nstep=env.config.physics.n_substeps)
         return data.qpos[:3].copy()
 
     controls = np.asarray(ctrl, float)
-    theirs, pushed = (np.stack([in_c(one, push) for one in controls]) for push in (0.0, 1e-6))
+    theirs = np.stack([in_c(one) for one in controls])
     apart = np.linalg.norm(ours - theirs, axis=1)
-    return apart, np.linalg.norm(pushed - theirs, axis=1), theirs
+    # Of those that are further apart, how far C MuJoCo's own robot moves by pushes of 1e-6 a step.
+    pushed = np.zeros(robots)
+    for i in np.flatnonzero(apart > FAR):
+        ends = [in_c(controls[i], 1e-6, seed) for seed in range(8)]
+        pushed[i] = np.linalg.norm(ends - theirs[i], axis=1).max()
+    return apart, pushed, theirs
 
 
 @pytest.mark.parametrize("name", OWN_ROBOTS)
@@ -150,10 +158,8 @@ def test_a_hundred_of_them_stay_together_for_four_seconds(env_of, name):
     apart, pushed, _ = drive_both_ways(env_of(name), 128, 4.0)
     print(f"\n{name}: median {1e3 * np.median(apart):.4f} mm, largest {1e3 * apart.max():.3f} mm")
     assert np.median(apart) < 5e-5
-    # One that is further away is as sensitive to a push of 1e-6 m/s in C MuJoCo itself.
-    explained = (apart < 2e-3) | (pushed > 0.1 * apart)
-    assert explained.all()
-    assert (apart < 2e-3).mean() >= 0.99
+    assert ((apart <= FAR) | (pushed > 0.5 * apart)).all()
+    assert (apart <= FAR).mean() >= 0.99
 
 
 OWN_DRIVE = """
