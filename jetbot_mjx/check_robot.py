@@ -64,7 +64,7 @@ def _config(file: Path, overrides: Sequence[str]) -> Config:
         from jetbot_mjx.envs import guess_section
 
         files: Mapping[str, bytes] = model_files(register(file)) or {}
-        section = guess_section(file.name, files[file.name].decode(), files)
+        section = guess_section(file.name, files)
         if not section:
             raise UserError(
                 f"{file}: no actuators turn wheels on both sides: give a configuration that names"

@@ -6,7 +6,7 @@ which has copies of the files, and after the user has changed them.
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -40,7 +40,9 @@ def register(path: Path, code: str | None = None) -> str:
         there are more than `MAX_BYTES`.
     """
     files: dict[str, bytes] = {}
-    _collect(path, path.parent, files)
+    trees: list[ElementTree.Element] = []
+    _collect(path, path.parent, files, trees)
+    _collect_assets(trees, path.parent, files)
     if code is not None:
         _read(path.parent / code, path.parent, files)
     if (size := sum(map(len, files.values()))) > MAX_BYTES:
@@ -68,32 +70,45 @@ def model_files(digest: str) -> Mapping[str, bytes] | None:
     return _MODELS.get(digest)
 
 
-def _collect(path: Path, root: Path, files: dict[str, bytes]) -> None:
-    """Add a model's file and those that it names."""
+def _collect(
+    path: Path, root: Path, files: dict[str, bytes], trees: list[ElementTree.Element]
+) -> None:
+    """Add a model's file and those that it includes, and what they hold."""
     before = len(files)
     text = _read(path, root, files)
     if len(files) == before:
         return
     try:
         tree = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
+    # The latter two are of an encoding that this reader does not have.
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise ConfigError(f"robot.file {path}: this is not XML: {error}") from None
     if tree.tag not in ("mujoco", "mujocoinclude"):
         raise ConfigError(
             f"robot.file {path}: <{tree.tag}> is not a MuJoCo model: its root should be <mujoco>"
         )
-    folders = {}
-    for compiler in tree.iter("compiler"):
-        folders |= compiler.attrib
+    trees.append(tree)
     for element in tree.iter():
-        name = element.get("file")
-        if name is None:
+        if element.tag in ("include", "model") and (name := element.get("file")):
+            _collect(root / name, root, files, trees)
+
+
+def _collect_assets(
+    trees: Sequence[ElementTree.Element], root: Path, files: dict[str, bytes]
+) -> None:
+    """Add what a model's files name: meshes, textures and height fields."""
+    compiler = {}
+    for tree in trees:
+        for element in tree.iter("compiler"):
+            compiler |= element.attrib
+    for element in (one for tree in trees for one in tree.iter()):
+        if element.tag not in _FOLDERS:
             continue
-        if element.tag == "include":
-            _collect(root / name, root, files)
-        elif element.tag in _FOLDERS:
-            folder = folders.get(_FOLDERS[element.tag], folders.get("assetdir", ""))
-            _read(root / folder / name, root, files)
+        folder = compiler.get(_FOLDERS[element.tag], compiler.get("assetdir", ""))
+        # A cube's texture has a file for each side.
+        for name in (value for key, value in element.items() if key.startswith("file")):
+            inner = Path(name).name if compiler.get("strippath") == "true" else name
+            _read(root / folder / inner, root, files)
 
 
 def _read(path: Path, root: Path, files: dict[str, bytes]) -> bytes:
