@@ -6,6 +6,7 @@ which has copies of the files, and after the user has changed them.
 """
 
 import hashlib
+import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -46,10 +47,7 @@ def register(path: Path, code: str | None = None) -> str:
     if code is not None:
         _read(path.parent / code, path.parent, files)
     if (size := sum(map(len, files.values()))) > MAX_BYTES:
-        raise ConfigError(
-            f"robot.file {path}: its files have {size:,} bytes, more than {MAX_BYTES:,}: leave out"
-            " what only shows"
-        )
+        raise _too_large(path, size)
     digest = hashlib.sha256(path.name.encode())
     for name, content in sorted(files.items()):
         digest.update(f"{name}\0{len(content)}\0".encode() + content)
@@ -111,9 +109,20 @@ def _collect_assets(
             _read(root / folder / inner, root, files)
 
 
+def _too_large(path: Path, size: int) -> ConfigError:
+    return ConfigError(
+        f"robot.file {path}: {size:,} bytes are more than {MAX_BYTES:,}: leave out what only shows"
+    )
+
+
 def _read(path: Path, root: Path, files: dict[str, bytes]) -> bytes:
     """Read one file, and add it."""
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ConfigError(f"robot.file {path} is no regular file")
+        if status.st_size > MAX_BYTES:
+            raise _too_large(path, status.st_size)
         content = path.read_bytes()
     except FileNotFoundError:
         raise ConfigNotFoundError(f"robot.file {path} does not exist") from None

@@ -1,5 +1,7 @@
 """The files of a robot's model: which they are, their hash, and what is refused."""
 
+import os
+
 import pytest
 
 from jetbot_mjx.config import ConfigError, robot_files
@@ -82,3 +84,10 @@ def test_folders_count_in_all_files_and_may_be_stripped_and_a_cube_has_six_sides
     (model.parent / "t" / "side.png").write_bytes(b"")
     model.write_text(model.read_text().replace('fileup="b', 'fileup="side'))
     assert set(model_files(register(model))) == names | {"t/side.png"}
+
+
+def test_what_is_no_file_is_not_waited_for(model):
+    model.unlink()
+    os.mkfifo(model)
+    with pytest.raises(ConfigError, match="is no regular file"):
+        register(model)
