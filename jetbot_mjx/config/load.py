@@ -9,7 +9,7 @@ from jetbot_mjx.config.errors import ConfigError
 from jetbot_mjx.config.files import find_config
 from jetbot_mjx.config.robot import RobotConfig
 from jetbot_mjx.config.robot_files import FOLDER
-from jetbot_mjx.config.robot_mjcf import is_model
+from jetbot_mjx.config.robot_mjcf import MjcfRobotConfig, is_model
 from jetbot_mjx.config.run import Config, with_defaults
 from jetbot_mjx.config.task_modules import find_task_beside
 from jetbot_mjx.config.yaml_text import parse_any, read_yaml
@@ -69,9 +69,13 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
             given = f"--set {clipped(override)}"
             name += f" {given}"
             _apply_override(values, override, given)
-    if file is not None:
-        _find_robot_beside(file, values)
+    stored = _find_robot_beside(file, values) if file is not None else None
     resolved = parse_config(values, source=name)
+    if stored and isinstance(resolved.robot, MjcfRobotConfig) and resolved.robot.sha256 != stored:
+        raise ConfigError(
+            f"{name}: robot.sha256 = {shown(stored)} is not the hash of the model that was found,"
+            f" {resolved.robot.sha256!r}: restore its files, or leave the hash out"
+        )
     if file is not None:
         find_task_beside(file, resolved.task.name.partition(":")[0])
     return resolved
@@ -106,6 +110,8 @@ def _robots_first(overrides: Overrides, values: dict[str, object]) -> Overrides:
     """
     chosen = [x for x in overrides if _key_of(x) in ("robot.preset", "robot.file")]
     robot = values.get("robot")
+    if chosen and isinstance(robot, dict):
+        robot.pop("sha256", None)
     if chosen and isinstance(robot, dict) and RobotConfig.model_fields.keys() <= robot.keys():
         del values["robot"]
     others = [x for x in overrides if x not in chosen]
@@ -119,14 +125,19 @@ def _key_of(override: object) -> str:
     return str(override).partition("=")[0].strip()
 
 
-def _find_robot_beside(config: Path, values: dict[str, object]) -> None:
-    """Set the robot's file to the one beside a configuration file, or stored in its run."""
+def _find_robot_beside(config: Path, values: dict[str, object]) -> object:
+    """Set the robot's file to the one beside a configuration file, or stored in its run.
+
+    Returns:
+      The hash that the configuration had of the model; None: it had none, or it is not found.
+    """
     robot = values.get("robot")
     if isinstance(robot, dict) and isinstance(name := robot.get("file"), str):
         for folder in (config.parent, config.parent / FOLDER):
             if (folder / name).is_file():
                 robot["file"] = str(folder / name)
-                return
+                return robot.pop("sha256", None)
+    return None
 
 
 def parse_config(values: Mapping[str, object], source: str = "config") -> Config:

@@ -6,7 +6,8 @@ which has copies of the files, and after the user has changed them.
 """
 
 import hashlib
-from collections.abc import Mapping
+import stat
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -40,14 +41,13 @@ def register(path: Path, code: str | None = None) -> str:
         there are more than `MAX_BYTES`.
     """
     files: dict[str, bytes] = {}
-    _collect(path, path.parent, files)
+    trees: list[ElementTree.Element] = []
+    _collect(path, path.parent, files, trees)
+    _collect_assets(trees, path.parent, files)
     if code is not None:
         _read(path.parent / code, path.parent, files)
     if (size := sum(map(len, files.values()))) > MAX_BYTES:
-        raise ConfigError(
-            f"robot.file {path}: its files have {size:,} bytes, more than {MAX_BYTES:,}: leave out"
-            " what only shows"
-        )
+        raise _too_large(path, size)
     digest = hashlib.sha256(path.name.encode())
     for name, content in sorted(files.items()):
         digest.update(f"{name}\0{len(content)}\0".encode() + content)
@@ -68,37 +68,61 @@ def model_files(digest: str) -> Mapping[str, bytes] | None:
     return _MODELS.get(digest)
 
 
-def _collect(path: Path, root: Path, files: dict[str, bytes]) -> None:
-    """Add a model's file and those that it names."""
+def _collect(
+    path: Path, root: Path, files: dict[str, bytes], trees: list[ElementTree.Element]
+) -> None:
+    """Add a model's file and those that it includes, and what they hold."""
     before = len(files)
     text = _read(path, root, files)
     if len(files) == before:
         return
     try:
         tree = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
+    # The latter two are of an encoding that this reader does not have.
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise ConfigError(f"robot.file {path}: this is not XML: {error}") from None
     if tree.tag not in ("mujoco", "mujocoinclude"):
         raise ConfigError(
             f"robot.file {path}: <{tree.tag}> is not a MuJoCo model: its root should be <mujoco>"
         )
-    folders = {}
-    for compiler in tree.iter("compiler"):
-        folders |= compiler.attrib
+    trees.append(tree)
     for element in tree.iter():
-        name = element.get("file")
-        if name is None:
+        if element.tag in ("include", "model") and (name := element.get("file")):
+            _collect(root / name, root, files, trees)
+
+
+def _collect_assets(
+    trees: Sequence[ElementTree.Element], root: Path, files: dict[str, bytes]
+) -> None:
+    """Add what a model's files name: meshes, textures and height fields."""
+    compiler = {}
+    for tree in trees:
+        for element in tree.iter("compiler"):
+            compiler |= element.attrib
+    for element in (one for tree in trees for one in tree.iter()):
+        if element.tag not in _FOLDERS:
             continue
-        if element.tag == "include":
-            _collect(root / name, root, files)
-        elif element.tag in _FOLDERS:
-            folder = folders.get(_FOLDERS[element.tag], folders.get("assetdir", ""))
-            _read(root / folder / name, root, files)
+        folder = compiler.get(_FOLDERS[element.tag], compiler.get("assetdir", ""))
+        # A cube's texture has a file for each side.
+        for name in (value for key, value in element.items() if key.startswith("file")):
+            inner = Path(name).name if compiler.get("strippath") == "true" else name
+            _read(root / folder / inner, root, files)
+
+
+def _too_large(path: Path, size: int) -> ConfigError:
+    return ConfigError(
+        f"robot.file {path}: {size:,} bytes are more than {MAX_BYTES:,}: leave out what only shows"
+    )
 
 
 def _read(path: Path, root: Path, files: dict[str, bytes]) -> bytes:
     """Read one file, and add it."""
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ConfigError(f"robot.file {path} is no regular file")
+        if status.st_size > MAX_BYTES:
+            raise _too_large(path, status.st_size)
         content = path.read_bytes()
     except FileNotFoundError:
         raise ConfigNotFoundError(f"robot.file {path} does not exist") from None

@@ -5,7 +5,7 @@ Every message names what is wrong in the user's file and what would be right.
 
 import difflib
 import types
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,14 @@ _VIEWS = {"chase": ((-0.55, 0.0, 0.40), 30.0, 58.0), "onboard": ((0.031, 0.0, 0.
 """Cameras for videos: place [m], angle by which they look down [°], vertical field of view [°]."""
 
 
+_OPTIONS_OF_MODEL = ("integrator", "gravity", "density", "viscosity", "wind", "impratio")
+"""Options of MuJoCo that a robot's model decides, beside the flags that disable a part of it."""
+
+
+_SIZES = ("memory", "njmax", "nconmax", "nstack")
+"""Sizes of MuJoCo's memory, of which the scene has its own."""
+
+
 class RobotFileError(UserError):
     """A robot's model cannot be used."""
 
@@ -62,12 +70,19 @@ def load_spec(robot: MjcfRobotConfig) -> mujoco.MjSpec:
             robot, "this process has not read this model: load a configuration that names its file"
         )
     try:
-        text, others = files[robot.file].decode(), dict(files)
-        spec = mujoco.MjSpec.from_string(text, include=others, assets=others)
+        spec = _parse(robot.file, files)
         spec.copy().compile()
     except (ValueError, mujoco.FatalError) as error:
         raise RobotFileError(robot, f"MuJoCo refuses it: {error}") from None
     return spec
+
+
+def _parse(file: str, files: Mapping[str, bytes]) -> mujoco.MjSpec:
+    """Return the model of a file and of those that it names."""
+    # MuJoCo refuses a name that is in both, also if the folders differ.
+    models = {name: content for name, content in files.items() if name.endswith(".xml")}
+    assets = {name: content for name, content in files.items() if name not in models}
+    return mujoco.MjSpec.from_string(files[file].decode(), include=models, assets=assets)
 
 
 def find_base(robot: MjcfRobotConfig, spec: mujoco.MjSpec) -> mujoco.MjsBody:
@@ -91,6 +106,12 @@ def find_base(robot: MjcfRobotConfig, spec: mujoco.MjSpec) -> mujoco.MjsBody:
             robot,
             "no body of the world has a free joint, so that the robot cannot move: add <freejoint/>"
             " to its base",
+        )
+    if "" in names:
+        raise RobotFileError(robot, "the body with a free joint has no name: give it one")
+    if any(body.frame is not None for body in free):
+        raise RobotFileError(
+            robot, "the body with a free joint is in a <frame>: put it into <worldbody> itself"
         )
     if robot.base is None and len(free) > 1:
         raise RobotFileError(
@@ -120,26 +141,27 @@ def add_robot(scene: mujoco.MjSpec, robot: MjcfRobotConfig) -> None:
     spec = load_spec(robot)
     base = find_base(robot, spec)
     name = base.name
-    others = [body.name for body in spec.worldbody.bodies if body.name != name]
+    # What the angles of its pose in the file would otherwise overrule when it is set to its rest.
+    base.alt.type, base.quat = mujoco.mjtOrientation.mjORIENTATION_QUAT, (1.0, 0.0, 0.0, 0.0)
+    planes = [one for one in spec.worldbody.geoms if one.type == mujoco.mjtGeom.mjGEOM_PLANE]
+    others = [one for one in spec.worldbody.bodies if one.name != name]
+    others += [one for one in spec.worldbody.geoms if one not in planes]
     if others:
+        named = ", ".join(one.name or f"a {_kind(one)} without a name" for one in others)
         raise RobotFileError(
-            robot,
-            f"{', '.join(others)} is beside the robot: scenery belongs to a task's build_scene",
+            robot, f"{named} is beside the robot: scenery belongs to a task's build_scene"
         )
     floor = scene.geom("floor")
     floor.contype = floor.conaffinity = 1
-    for geom in list(spec.worldbody.geoms):
-        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
-            for attribute in ("friction", "condim", "priority", "solref", "solimp", "solmix"):
-                setattr(floor, attribute, getattr(geom, attribute))
-        spec.delete(geom)
-    for element in (*spec.worldbody.cameras, *spec.worldbody.lights, *spec.keys):
+    for plane in planes:
+        for attribute in ("friction", "condim", "priority", "solref", "solimp", "solmix"):
+            setattr(floor, attribute, getattr(plane, attribute))
+    # No observation is a sensor's.
+    needless = (*planes, *spec.worldbody.cameras, *spec.worldbody.lights, *spec.keys, *spec.sensors)
+    for element in needless:
         spec.delete(element)
     scale = max(1.0, _extent(spec, name) / _DRAWN_EXTENT)
-    scene.option.integrator = spec.option.integrator
-    scene.option.disableflags |= spec.option.disableflags
-    scene.option.density, scene.option.viscosity = spec.option.density, spec.option.viscosity
-    scene.option.impratio = spec.option.impratio
+    _take_options(scene, spec)
     try:
         scene.attach(spec, prefix=PREFIX, frame=scene.worldbody.add_frame())
     except (ValueError, mujoco.FatalError) as error:
@@ -147,6 +169,30 @@ def add_robot(scene: mujoco.MjSpec, robot: MjcfRobotConfig) -> None:
     body = scene.body(PREFIX + name)
     for camera, (place, down, fovy) in _VIEWS.items():
         body.add_camera(name=camera, pos=scale * np.array(place), quat=_ahead(down), fovy=fovy)
+
+
+def _kind(part: mujoco.MjsBody | mujoco.MjsGeom) -> str:
+    return "body" if isinstance(part, mujoco.MjsBody) else "geom"
+
+
+def _take_options(scene: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
+    """Give a scene the options of a model that the section `physics` does not decide.
+
+    All others of the model become those of the scene: MuJoCo would print each that differs.
+    """
+    scene.option.disableflags |= spec.option.disableflags
+    for name in _OPTIONS_OF_MODEL:
+        setattr(scene.option, name, getattr(spec.option, name))
+    looks = [name for name in dir(scene.visual) if not name.startswith("_")]
+    parts = [(spec.option, scene.option)]
+    parts += [(getattr(spec.visual, name), getattr(scene.visual, name)) for name in looks]
+    for own, scenes in parts:
+        for name in dir(scenes):
+            if not name.startswith("_"):
+                setattr(own, name, getattr(scenes, name))
+    for name in dir(scene):
+        if name in _SIZES or name.startswith("nuser"):
+            setattr(spec, name, getattr(scene, name))
 
 
 def _extent(spec: mujoco.MjSpec, base: str) -> float:
@@ -197,9 +243,7 @@ def find_drive(robot: MjcfRobotConfig, task: TaskConfig, model: mujoco.MjModel) 
             robot.wheel_separation or apart,
             tuple(sorted(wheels)),
         )
-    turning = {one.actuator for one in steered}
-    still = [one.x for one in wheels if not parts.turns(one.actuator, turning)]
-    rear = float(np.mean(still or [min(one.x for one in steered)]))
+    rear = parts.rear(wheels, steered)
     angles = parts.limits(steered)
     curvature = largest_curvature(steered, rear, angles)
     return AckermannDrive(task.max_speed, curvature, radius, rear, wheels, steered)
@@ -215,7 +259,7 @@ def _own_drive(robot: MjcfRobotConfig, model: mujoco.MjModel) -> OwnDrive:
         action = jax.ShapeDtypeStruct((robot.action_size,), jnp.float32)
         shape = jax.eval_shape(drive.controls, action).shape
     # It is the user's code: whatever it raises belongs into the one line.
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         reason = f"{type(error).__name__}: {error}"
         raise RobotFileError(robot, f"robot.drive = {robot.drive!r}: {reason}") from None
     if shape != (model.nu,):
@@ -246,6 +290,9 @@ class _Parts:
         }
         if shared := {*sides.left} & {*sides.right}:
             raise self._error(key, f"{', '.join(sorted(shared))} is on both sides")
+        for side, names in (("left", sides.left), ("right", sides.right)):
+            if twice := {name for name in names if names.count(name) > 1}:
+                raise self._error(f"{key}.{side}", f"{', '.join(sorted(twice))} is named twice")
         for side, sign in (("left", 1.0), ("right", -1.0)):
             for name, wheel in zip(getattr(sides, side), found[side], strict=True):
                 if sign * wheel.y <= 0:
@@ -274,9 +321,8 @@ class _Parts:
 
     def limits(self, steered: Sequence[Wheel]) -> Float[np.ndarray, " n"]:
         """Return the largest angle of each steered wheel [rad]."""
-        angles = []
+        angles, model = [], self._model
         for one in steered:
-            model = self._model
             name = model.actuator(one.actuator).name.removeprefix(PREFIX)
             if not model.actuator_ctrllimited[one.actuator]:
                 raise self._error("steering", f"{name} has no limits: give it a ctrlrange [rad]")
@@ -287,17 +333,41 @@ class _Parts:
                 f"angles of {min(angles):.3g} to {max(angles):.3g} rad: 0.02 to 1.4 are"
                 " right, and a ctrlrange is in radians",
             )
-        return np.array(angles)
+        joints = [self._joint(one.actuator) for one in steered]
+        stops = np.abs(model.jnt_range[joints]).min(axis=1)
+        return np.minimum(angles, np.where(model.jnt_limited[joints], stops, np.inf))
 
-    def turns(self, actuator: int, turning: Iterable[int]) -> bool:
-        """Return whether a driven wheel is on a part that a steering actuator turns."""
-        bodies = {self._model.jnt_bodyid[self._joint(one)] for one in turning}
-        body = self._model.jnt_bodyid[self._joint(actuator)]
-        while body:
-            if body in bodies:
-                return True
+    def rear(self, driven: Sequence[Wheel], steered: Sequence[Wheel]) -> float:
+        """Return how far ahead of the base the wheels are that do not turn to the side [m].
+
+        Those are the driven ones, else, of a car with front-wheel drive, those without an actuator.
+        Of a car that steers all wheels, the rear ones then stay straight.
+        """
+        model = self._model
+        turning = {model.jnt_bodyid[self._joint(one.actuator)] for one in steered}
+        hinges = [
+            joint
+            for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).tolist()
+            if abs(self._axis(joint)[1]) > _PARALLEL and not self._is_on(joint, turning)
+        ]
+        of_motors = [one for one in hinges if one in {self._joint(x.actuator) for x in driven}]
+        still = [self._place(joint)[0] for joint in of_motors or hinges]
+        return float(np.mean(still or [min(one.x for one in steered)]))
+
+    def _is_on(self, joint: int, bodies: Collection[int]) -> bool:
+        """Return whether a joint's body is one of some bodies, or on one."""
+        body = self._model.jnt_bodyid[joint]
+        while body and body not in bodies:
             body = self._model.body_parentid[body]
-        return False
+        return body in bodies
+
+    def _axis(self, joint: int) -> Float[np.ndarray, "3"]:
+        """Return the axis of a joint in the frame of the base."""
+        return self._rotation.T @ self._data.xaxis[joint]
+
+    def _place(self, joint: int) -> Float[np.ndarray, "3"]:
+        """Return the place of a joint in the frame of the base [m]."""
+        return self._rotation.T @ (self._data.xanchor[joint] - self._data.xpos[self._base])
 
     def _joint(self, actuator: int) -> int:
         return self._model.actuator_trnid[actuator, 0]
@@ -325,8 +395,7 @@ class _Parts:
             raise self._error(key, f"{name} drives {self._joint_name(joint)}, which is no hinge")
         steers = key.startswith("steering")
         self._check_servo(index, name, key, steers=steers)
-        axis = self._rotation.T @ self._data.xaxis[joint]
-        place = self._rotation.T @ (self._data.xanchor[joint] - self._data.xpos[self._base])
+        axis, place = self._axis(joint), self._place(joint)
         along = axis[2 if steers else 1]
         if abs(along) < _PARALLEL:
             wanted = "up (0 0 1)" if steers else "to the left (0 1 0)"
@@ -383,20 +452,18 @@ def _numbers(vector: Float[np.ndarray, "3"]) -> str:
     return f"({' '.join(f'{x:.2g}' for x in np.round(vector, 3) + 0.0)})"
 
 
-def guess_section(file: str, text: str, files: Mapping[str, bytes]) -> dict[str, object]:
+def guess_section(file: str, files: Mapping[str, bytes]) -> dict[str, object]:
     """Return a section `robot` for a model: its actuators by what they turn, and by their side.
 
     Args:
       file: name of the model.
-      text: the MJCF.
-      files: the files that it names.
+      files: its content, and that of the files that it names.
 
     Returns:
       The section; empty where no actuator turns a wheel, or the model cannot be compiled.
     """
     try:
-        spec = mujoco.MjSpec.from_string(text, include=dict(files), assets=dict(files))
-        model = spec.compile()
+        model = _parse(file, files).compile()
     except (ValueError, mujoco.FatalError):
         return {}
     data = mujoco.MjData(model)

@@ -201,7 +201,8 @@ def _remove_visuals(spec: mujoco.MjSpec) -> None:
         # The mass of a body that does not state its own is that of its geoms.
         if not collides and (geom.mass == 0 or geom.parent.explicitinertial):
             spec.delete(geom)
-    for element in (*spec.cameras, *spec.lights, *spec.sites):
+    holds = spec.tendons or spec.equalities
+    for element in (*spec.cameras, *spec.lights, *(() if holds else spec.sites)):
         spec.delete(element)
     for body in spec.bodies:
         if body.mocap and not body.geoms:

@@ -21,6 +21,7 @@ from jetbot_mjx.errors import UserError
 
 _SECONDS = 2.0  # [s] of a trial, of which the second half is measured
 _SLOWEST, _FASTEST = 0.3, 3.0  # of the commanded speed
+_LEAST_TURN = 0.02  # of the commanded turn
 _CURVE = (-0.6, 0.5)
 """Action of the curve: a fifth of the speed, and half of the largest turn."""
 _HOLD = 0.25  # [s] for which the trial of the motors holds a command
@@ -57,7 +58,13 @@ def drive_trial(config: Config, model: mujoco.MjModel, drive: Drive) -> Trial | 
     count = round(2 * _SECONDS / _HOLD)
     limits = np.random.default_rng(0).choice([-1.0, 1.0], (count, drive.action_size))
     held = round(_HOLD / model.opt.timestep)
-    path = _run(model, np.repeat(_controls(drive, limits), held, axis=0))
+    switching = _controls(drive, limits)
+    if not np.all(np.isfinite(switching)):
+        action = limits[np.flatnonzero(~np.isfinite(switching).all(axis=1))[0]].tolist()
+        raise _error(
+            config, f"its drive gives a control that is not finite for the action {action}"
+        )
+    path = _run(model, np.repeat(switching, held, axis=0))
     if path is None:
         raise _error(
             config,
@@ -84,9 +91,18 @@ def drive_trial(config: Config, model: mujoco.MjModel, drive: Drive) -> Trial | 
         )
     length = np.linalg.norm(np.diff(curve[half:, :2], axis=0), axis=1).sum()
     turned = curve[half:, 2].mean() * (_SECONDS - half * model.opt.timestep)
+    rate = float(curve[half:, 2].mean())
     if isinstance(drive, AckermannDrive):
-        return Trial(share, float(turned / length / (0.5 * drive.max_curvature)))
-    return Trial(share, float(curve[half:, 2].mean() / (0.5 * drive.max_yaw_rate)))
+        turn = float(turned / length / (0.5 * drive.max_curvature))
+    else:
+        turn = rate / (0.5 * drive.max_yaw_rate)
+    if turn < _LEAST_TURN:
+        raise _error(
+            config,
+            f"told to turn half as fast as it may, it turns with {rate:.3g} rad/s: a joint or"
+            " another part holds it, or the wheels are too far apart for their grip",
+        )
+    return Trial(share, turn)
 
 
 def _controls(drive: Drive, actions: Float[np.ndarray, "n action"]) -> Float[np.ndarray, "n nu"]:

@@ -113,14 +113,15 @@ def read_config(run_dir: Path) -> Config:
         if _LAST_SECTION not in values:
             raise ConfigError(f"{CONFIG} was cut off: it has no section {_LAST_SECTION}")
         return parse_stored(values, run_dir, CONFIG)
+    # One of them is a `FileNotFoundError` too.
+    except ConfigError as error:
+        raise DamagedRunError(run_dir, str(error)) from None
     except FileNotFoundError:
         raise DamagedRunError(run_dir, f"{CONFIG} is missing") from None
     except UnicodeDecodeError:
         raise DamagedRunError(run_dir, f"{CONFIG} is not UTF-8 text") from None
     except OSError as error:
         raise DamagedRunError(run_dir, f"{CONFIG} cannot be read: {error.strerror}") from None
-    except ConfigError as error:
-        raise DamagedRunError(run_dir, str(error)) from None
 
 
 def parse_stored(values: Mapping[str, object], run_dir: Path, source: str) -> Config:

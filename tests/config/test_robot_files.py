@@ -1,5 +1,7 @@
 """The files of a robot's model: which they are, their hash, and what is refused."""
 
+import os
+
 import pytest
 
 from jetbot_mjx.config import ConfigError, robot_files
@@ -17,7 +19,7 @@ def model(tmp_path):
     for name in ("m/a.stl", "m/c.stl", "t/b.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(name.encode())
-    (tmp_path / "parts.xml").write_text(PARTS.replace("c.stl", "m/c.stl"))
+    (tmp_path / "parts.xml").write_text(PARTS)
     (tmp_path / "model.xml").write_text(MODEL)
     return tmp_path / "model.xml"
 
@@ -45,6 +47,8 @@ def test_the_hash_is_of_all_of_them(model):
         ('<mujoco><include file="none.xml"/></mujoco>', "none.xml does not exist"),
         ("<robot/>", "<robot> is not a MuJoCo model: its root should be <mujoco>"),
         ("<mujoco>", "this is not XML: no element found"),
+        ('<?xml version="1.0" encoding="none"?><mujoco/>', "not XML: unknown encoding: none"),
+        ('<?xml version="1.0" encoding="shift_jis"?><mujoco/>', "not XML: multi-byte encodings"),
     ],
 )
 def test_what_is_no_model_is_refused_in_one_line(model, text, said):
@@ -64,4 +68,26 @@ def test_a_model_that_includes_itself_ends(model):
 def test_large_models_are_refused(model, monkeypatch):
     monkeypatch.setattr(robot_files, "MAX_BYTES", 100)
     with pytest.raises(ConfigError, match="more than 100: leave out what only shows"):
+        register(model)
+
+
+def test_folders_count_in_all_files_and_may_be_stripped_and_a_cube_has_six_sides(model):
+    cube = '<texture type="cube" file="x/b.png" fileup="b.png" filedown="b.png"/>'
+    mesh = '<mesh file="x/a.stl"/><model name="n" file="other.xml"/>'
+    (model.parent / "parts.xml").write_text(
+        '<mujocoinclude><compiler meshdir="m" texturedir="t" strippath="true"/></mujocoinclude>'
+    )
+    (model.parent / "other.xml").write_text("<mujoco/>")
+    model.write_text(f'<mujoco><include file="parts.xml"/><asset>{cube}{mesh}</asset></mujoco>')
+    names = {"model.xml", "parts.xml", "other.xml", "m/a.stl", "t/b.png"}
+    assert set(model_files(register(model))) == names
+    (model.parent / "t" / "side.png").write_bytes(b"")
+    model.write_text(model.read_text().replace('fileup="b', 'fileup="side'))
+    assert set(model_files(register(model))) == names | {"t/side.png"}
+
+
+def test_what_is_no_file_is_not_waited_for(model):
+    model.unlink()
+    os.mkfifo(model)
+    with pytest.raises(ConfigError, match="is no regular file"):
         register(model)

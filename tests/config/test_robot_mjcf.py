@@ -59,3 +59,24 @@ def test_what_a_car_does_not_have_is_not_drawn():
     load_robot("car", "randomization.friction=[0.5, 1]")
     with pytest.raises(ConfigError, match=r"randomization.motor_lag is of motors on two sides"):
         load_robot("car", "randomization.motor_lag=[0, 0.1]")
+
+
+def test_a_stored_configuration_finds_its_model_in_the_run_or_refuses_it(tmp_path):
+    config = load_config(copy_robot(tmp_path, "turtlebot"))
+    run = tmp_path / "run"
+    (run / "robot").mkdir(parents=True)
+    (run / "config.yaml").write_text(config.to_yaml())
+    (tmp_path / "turtlebot.xml").rename(run / "robot" / "turtlebot.xml")
+    assert load_config(run / "config.yaml").robot == config.robot
+    (run / "robot" / "turtlebot.xml").write_text("<mujoco/>")
+    with pytest.raises(ConfigError, match="is not the hash of the model that was found"):
+        load_config(run / "config.yaml")
+
+
+def test_another_model_than_the_stored_one_has_a_hash_of_its_own(tmp_path):
+    config = load_config(copy_robot(tmp_path, "turtlebot"))
+    other = tmp_path / "other.xml"
+    other.write_bytes((tmp_path / "turtlebot.xml").read_bytes())
+    changed = load_config(config, {"robot.file": str(other)})
+    assert changed.robot.file == "other.xml"
+    assert changed.robot.sha256 != config.robot.sha256

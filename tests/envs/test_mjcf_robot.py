@@ -16,6 +16,7 @@ from jetbot_mjx.config import MjcfRobotConfig, load_config, model_files, parse_c
 from jetbot_mjx.envs import make_env
 from jetbot_mjx.envs.mjcf_robot import guess_section
 from jetbot_mjx.envs.robot_model import robot_body
+from jetbot_mjx.envs.robot_trial import drive_trial
 from jetbot_mjx.errors import UserError
 
 HOLD = 16
@@ -97,12 +98,12 @@ def test_parts_are_guessed_by_their_axes_and_sides():
         robot = load_robot(name).robot
         assert isinstance(robot, MjcfRobotConfig)
         files = model_files(robot.sha256)
-        section = guess_section(robot.file, files[robot.file].decode(), files)
+        section = guess_section(robot.file, files)
         given = robot.model_dump(mode="json", exclude_defaults=True, exclude={"sha256"})
         given.pop("wheel_separation", None)
         assert section == given
-    assert guess_section("x.xml", "<mujoco/>", {}) == {}
-    assert guess_section("x.xml", "<mujoco><body/></mujoco>", {}) == {}
+    assert guess_section("x.xml", {"x.xml": b"<mujoco/>"}) == {}
+    assert guess_section("x.xml", {"x.xml": b"\xff"}) == {}
 
 
 FAR = 2e-3  # [m] that few robots are apart, and by pushes C MuJoCo's own too
@@ -196,6 +197,11 @@ def test_an_own_function_drives_all_actuators(own_drive):
         ("def controls(action): return action[:3]", "returns the shape [3]: the model has 4"),
         ("def control(action): return action", "AttributeError: module 'wheels' has no attribute"),
         ("import nothing_like_it", "ModuleNotFoundError: No module named 'nothing_like_it'"),
+        ("raise SystemExit(0)", "robot.drive = 'wheels.py:controls': SystemExit: 0"),
+        (
+            "def controls(action): return action / 0.0",
+            "a control that is not finite for the action",
+        ),
         ("def controls(action): return 1e6 * action", "unstable with physics.sim_dt"),
     ],
 )
@@ -242,3 +248,67 @@ def test_the_exported_policies_of_the_examples_are_of_these_robots(name):
         seen = np.array([0.0, 0.5 * side, 0.0, side, 0.5, 0.1, 0.0], np.float32)
         action, _ = module.act(seen)
         assert side * action[1] > 0.3
+
+
+SENSORS = (
+    ("<freejoint/>", '<freejoint/><site name="imu"/><site name="other" pos="0 0 0.1"/>'),
+    ("</mujoco>", '<sensor><gyro site="imu"/><jointvel joint="left_wheel"/></sensor></mujoco>'),
+)
+STRUT = '<tendon><spatial name="t"><site site="imu"/><site site="other"/></spatial></tendon>'
+
+
+@pytest.mark.parametrize("more", ["", STRUT])
+def test_sites_of_sensors_and_tendons_do_no_harm(tmp_path, more):
+    changes = (*SENSORS, ("</mujoco>", f"{more}</mujoco>"))
+    env = make_env(load_config(copy_robot(tmp_path, "turtlebot", changes)))
+    assert env.physics.mj_model.nsensor == 0
+    assert env.physics.mj_model.ntendon == bool(more)
+
+
+def test_settings_of_a_model_are_taken_or_left_without_a_word(
+    tmp_path, monkeypatch, capfd, recwarn
+):
+    ours = (
+        '<option timestep="0.002" gravity="0 0 -3.7" solver="CG" o_solref="0.01 1"/>'
+        '<size memory="20M" nuserdata="3"/><statistic extent="3"/>'
+        '<visual><map znear="0.1"/><global offwidth="2000"/></visual><worldbody>'
+    )
+    config = load_config(copy_robot(tmp_path, "turtlebot", [("<worldbody>", ours)]))
+    monkeypatch.chdir(tmp_path)
+    option = make_env(config).physics.mj_model.opt
+    assert option.gravity[2] == -3.7
+    assert option.timestep == pytest.approx(config.physics.sim_dt)
+    assert capfd.readouterr() == ("", "")
+    assert not recwarn.list
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_angles_of_the_base_are_not_those_of_its_start(tmp_path):
+    changes = [('<body name="base"', '<body euler="0 0 0.5" name="base"')]
+    env = make_env(load_config(copy_robot(tmp_path, "turtlebot", changes)))
+    assert env.mj_model.qpos0[6] == 0.0
+
+
+def test_files_of_one_name_in_two_folders_are_two(tmp_path):
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+    for folder in ("shows", "touches"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "body.obj").write_text(corners)
+    meshes = '<asset><mesh name="s" file="shows/body.obj"/><mesh name="t" file="touches/body.obj"/>'
+    changes = [("<worldbody>", meshes + "</asset><worldbody>")]
+    assert make_env(load_config(copy_robot(tmp_path, "turtlebot", changes))).mj_model.nmesh == 2
+
+
+def test_a_car_with_front_wheel_drive_turns_about_its_rear_axle(tmp_path):
+    changes = [(f'joint="rear_{side}"', f'joint="front_{side}"') for side in ("left", "right")]
+    env = make_env(load_config(copy_robot(tmp_path, "car", changes)))
+    assert env.drive.rear == pytest.approx(0.0)
+    trial = drive_trial(env.config, env.physics.mj_model, env.drive)
+    assert trial.turn == pytest.approx(1.0, abs=0.05)
+
+
+def test_stops_of_the_steering_limit_it_too(tmp_path):
+    changes = [('range="-0.72 0.72"', 'range="-0.2 0.2"')]
+    car = make_env(load_config(copy_robot(tmp_path, "car", changes))).drive
+    controls = np.asarray(car.controls(jnp.array([0.0, car.max_curvature])))
+    assert np.abs(controls[2:]).max() == pytest.approx(0.2, rel=1e-5)

@@ -93,6 +93,38 @@ BROKEN = {
         (("</worldbody>", '<body name="wall"><geom size="0.1" pos="2 0 0"/></body></worldbody>'),),
         "wall is beside the robot: scenery belongs to a task's build_scene",
     ),
+    "a box without a name beside the robot": Broken(
+        "turtlebot",
+        (("</worldbody>", '<geom type="box" size="0.1 0.1 0.1"/></worldbody>'),),
+        "a geom without a name is beside the robot",
+    ),
+    "a base without a name": Broken(
+        "turtlebot", (('name="base"', ""),), "the body with a free joint has no name"
+    ),
+    "a base in a frame": Broken(
+        "turtlebot",
+        (
+            ('<body name="base"', '<frame><body name="base"'),
+            ("</worldbody>", "</frame></worldbody>"),
+        ),
+        "is in a <frame>: put it into <worldbody> itself",
+    ),
+    "one wheel twice": Broken(
+        "turtlebot",
+        (),
+        "robot.wheels.left: left is named twice",
+        {"wheels": {"left": ["left", "left"], "right": ["right"]}},
+    ),
+    "wheels that cannot turn apart": Broken(
+        "turtlebot",
+        (
+            (
+                "</mujoco>",
+                '<equality><joint joint1="left_wheel" joint2="right_wheel"/></equality></mujoco>',
+            ),
+        ),
+        "told to turn half as fast as it may, it turns with",
+    ),
     "millimetres": Broken(
         "turtlebot",
         (

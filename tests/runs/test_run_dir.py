@@ -8,14 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from jetbot_mjx.config import parse_config
+from helpers.own_robots import copy_robot
+from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import run_dir
 from jetbot_mjx.runs.run_dir import (
+    DamagedRunError,
     atomic_folder,
     changed_versions,
     make_folder,
     occupied,
+    read_config,
     seed_dirs,
     seed_folders,
     stored_config,
@@ -246,3 +249,13 @@ def test_a_pipe_in_the_place_of_an_unfinished_file_holds_nothing_up(tmp_path):
     with atomic_folder(tmp_path / "policy") as unfinished:
         (unfinished / "file").touch()
     assert {path.name for path in tmp_path.iterdir()} == {"config.yaml", "policy"}
+
+
+def test_a_run_without_its_robot_says_which_file_is_missing(tmp_path):
+    config = load_config(copy_robot(tmp_path, "turtlebot"))
+    # This process has read that model, and another one has not.
+    text = config.to_yaml().replace(config.robot.sha256, "f" * 64)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").write_text(text)
+    with pytest.raises(DamagedRunError, match=r"robot/turtlebot.xml does not exist"):
+        read_config(tmp_path / "run")

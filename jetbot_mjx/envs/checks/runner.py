@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, MjcfRobotConfig
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.checks import methods
 from jetbot_mjx.envs.checks.probe import (
@@ -23,6 +23,7 @@ from jetbot_mjx.envs.checks.probe import (
     first_key,
 )
 from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.mjcf_robot import PREFIX
 from jetbot_mjx.envs.robot_model import make_mj_model, mocap_ids
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.task import Task, layout_size, make_task
@@ -139,7 +140,11 @@ def _scene(probe: TaskProbe) -> Iterator[str]:
     if not solids - placed:
         yield from _touching(probe, solid)
     paired = set(solid.pair_geom1) | set(solid.pair_geom2)
+    is_model = isinstance(config.robot, MjcfRobotConfig)
     for i in range(solid.ngeom):
+        # A robot's model decides itself what of it touches the floor.
+        if is_model and (solid.geom(i).name == "floor" or solid.geom(i).name.startswith(PREFIX)):
+            continue
         if i not in paired and (solid.geom_contype[i] or solid.geom_conaffinity[i]):
             yield (
                 f"geom {solid.geom(i).name or i!r} can collide and is in no contact pair: give it"
