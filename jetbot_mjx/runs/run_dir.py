@@ -216,10 +216,11 @@ def write_run(run_dir: Path, config: Config, made_with: JsonObject) -> None:
       UserError: the folder cannot be written.
     """
     with writing_to(run_dir):
-        write_text(run_dir / CONFIG, config.to_yaml())
-        write_json(run_dir / _VERSIONS, made_with)
+        # A folder counts as a run by its configuration: first what that needs.
         if isinstance(config.robot, MjcfRobotConfig):
             _write_model(run_dir / FOLDER, config.robot)
+        write_text(run_dir / CONFIG, config.to_yaml())
+        write_json(run_dir / _VERSIONS, made_with)
 
 
 def _write_model(folder: Path, robot: MjcfRobotConfig) -> None:
