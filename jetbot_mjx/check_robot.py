@@ -53,10 +53,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     with startup.exit_on_interrupt():
-        from jetbot_mjx.envs import make_env, robot_facts
+        from jetbot_mjx.envs import describe_robot, make_env
     cli.prepare_device()
     env = make_env(_config(options.file, options.overrides))
-    for label, text in robot_facts(env):
+    for label, text in describe_robot(env):
         cli.tell(f"{label:10} {text}")
     _tell_cost(env)
     return 0

@@ -32,7 +32,7 @@ from .opengl import SceneRenderer as SceneRenderer
 from .opengl import find_backend as find_backend
 from .program_key import BUILT_IN_TASKS as BUILT_IN_TASKS
 from .program_key import open_program_cache as open_program_cache
-from .robot_facts import robot_facts as robot_facts
+from .robot_facts import describe_robot as describe_robot
 from .robot_facts import step_rate as step_rate
 from .robot_model import QPOS_QUAT as QPOS_QUAT
 from .robot_model import QPOS_XYZ as QPOS_XYZ

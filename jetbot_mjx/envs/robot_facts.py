@@ -18,7 +18,7 @@ _WELL = 0.05
 """Largest share by which a robot may turn less or more than it is told, without a hint."""
 
 
-def robot_facts(env: JetBotEnv) -> Iterator[tuple[str, str]]:
+def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
     """Yield what the robot is, and how it follows its commands, as a label and a text each.
 
     Args:

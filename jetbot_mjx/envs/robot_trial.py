@@ -54,24 +54,7 @@ def drive_trial(config: Config, model: mujoco.MjModel, drive: Drive) -> Trial | 
     steps = round(_SECONDS / model.opt.timestep)
     if not isinstance(drive, OwnDrive):
         _check_touch(config, model, drive)
-    # Commands that switch from limit to limit.
-    count = round(2 * _SECONDS / _HOLD)
-    limits = np.random.default_rng(0).choice([-1.0, 1.0], (count, drive.action_size))
-    held = round(_HOLD / model.opt.timestep)
-    switching = _controls(drive, limits)
-    if not np.all(np.isfinite(switching)):
-        action = limits[np.flatnonzero(~np.isfinite(switching).all(axis=1))[0]].tolist()
-        raise _error(
-            config, f"its drive gives a control that is not finite for the action {action}"
-        )
-    path = _run(model, np.repeat(switching, held, axis=0))
-    if path is None:
-        raise _error(
-            config,
-            f"it is unstable with physics.sim_dt = {model.opt.timestep:g} under commands that"
-            " switch: make that shorter, the actuators' gains smaller, or the joints' armature"
-            " larger",
-        )
+    _check_stable(config, model, drive)
     if isinstance(drive, OwnDrive):
         return None
     # Straight ahead, and in a curve.
@@ -103,6 +86,27 @@ def drive_trial(config: Config, model: mujoco.MjModel, drive: Drive) -> Trial | 
             " another part holds it, or the wheels are too far apart for their grip",
         )
     return Trial(share, turn)
+
+
+def _check_stable(config: Config, model: mujoco.MjModel, drive: Drive) -> None:
+    """Check that the robot stays finite under commands that switch from limit to limit."""
+    count = round(2 * _SECONDS / _HOLD)
+    limits = np.random.default_rng(0).choice([-1.0, 1.0], (count, drive.action_size))
+    held = round(_HOLD / model.opt.timestep)
+    switching = _controls(drive, limits)
+    if not np.all(np.isfinite(switching)):
+        action = limits[np.flatnonzero(~np.isfinite(switching).all(axis=1))[0]].tolist()
+        raise _error(
+            config, f"its drive gives a control that is not finite for the action {action}"
+        )
+    path = _run(model, np.repeat(switching, held, axis=0))
+    if path is None:
+        raise _error(
+            config,
+            f"it is unstable with physics.sim_dt = {model.opt.timestep:g} under commands that"
+            " switch: make that shorter, the actuators' gains smaller, or the joints' armature"
+            " larger",
+        )
 
 
 def _controls(drive: Drive, actions: Float[np.ndarray, "n action"]) -> Float[np.ndarray, "n nu"]:
