@@ -91,16 +91,19 @@ def _with_robot_of_file(values: Mapping[str, object]) -> Mapping[str, object]:
     robot = values.get("robot")
     if not isinstance(robot, Mapping) or not isinstance(robot.get("file"), str):
         return values
-    if is_model(robot) or RobotConfig.model_fields.keys() <= robot.keys():
+    if is_model(robot):
         return values
     path = Path(robot["file"])
+    values = {**values, "robot": {**robot, "file": path.name}}
+    if RobotConfig.model_fields.keys() <= robot.keys():
+        return values
     own = read_yaml(path, "robot.file")
     if "file" in own:
         raise ConfigError(f"robot.file {path}: file = {shown(own['file'])}: it is one itself")
     camera = own.pop("camera", {})
     measures = parse_config({"robot": own, "camera": camera}, f"robot.file {path}").robot
     defaults = {"robot": measures.model_dump(mode="json"), "camera": camera}
-    return with_defaults({**values, "robot": {**robot, "file": path.name}}, defaults)
+    return with_defaults(values, defaults)
 
 
 def _robots_first(overrides: Overrides, values: dict[str, object]) -> Overrides:

@@ -21,7 +21,7 @@ from .jetbot_env import make_env as make_env
 from .kinematics import to_body as to_body
 from .kinematics import turned as turned
 from .kinematics import yaw as yaw
-from .mjcf_robot import guess_section as guess_section
+from .mjcf_wheels import guess_section as guess_section
 from .mjx import make_data as make_data
 from .mujoco_env import MujocoJetBot as MujocoJetBot
 from .mujoco_env import Observation as Observation

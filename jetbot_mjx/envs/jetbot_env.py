@@ -22,7 +22,8 @@ from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, numbers_of, observation_shapes, see
 from jetbot_mjx.envs.drive import Drive, jetbot_drive
-from jetbot_mjx.envs.mjcf_robot import RobotFileError, find_drive
+from jetbot_mjx.envs.mjcf_robot import RobotFileError
+from jetbot_mjx.envs.mjcf_wheels import find_drive
 from jetbot_mjx.envs.physics import Physics
 from jetbot_mjx.envs.robot_trial import drive_trial
 from jetbot_mjx.envs.state import Obs, PhysicsState, State, robot_state

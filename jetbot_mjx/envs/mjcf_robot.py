@@ -1,47 +1,26 @@
-"""Make the scene of a robot that is a MuJoCo model of a user's own, and find its parts.
+"""Make the scene of a robot that is a MuJoCo model of a user's own.
 
 Every message names what is wrong in the user's file and what would be right.
 """
 
-import difflib
-import types
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from jetbot_mjx.config import MjcfRobotConfig, Sides, TaskConfig, model_files
-from jetbot_mjx.envs.drive import (
-    AckermannDrive,
-    DifferentialDrive,
-    Drive,
-    OwnDrive,
-    Wheel,
-    largest_curvature,
-)
+from jetbot_mjx.config import MjcfRobotConfig, model_files
 from jetbot_mjx.errors import UserError
 
 PREFIX = "robot/"
 """What the names of a robot's parts begin with in the scene."""
 
-_LARGEST_RADIUS = 0.5  # [m]
-_PERPENDICULAR = 0.2  # largest cosine between directions that should be perpendicular
-_PARALLEL = 0.95  # smallest cosine between directions that should be parallel
-_ROLLING = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID}
-_LONG = {mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE}
-
-
 _DRAWN_EXTENT = 0.12  # [m] of a JetBot, for which the views are made
 _VIEWS = {"chase": ((-0.55, 0.0, 0.40), 30.0, 58.0), "onboard": ((0.031, 0.0, 0.0538), 20.0, 115.0)}
 """Cameras for videos: place [m], angle by which they look down [°], vertical field of view [°]."""
 
-
 _OPTIONS_OF_MODEL = ("integrator", "gravity", "density", "viscosity", "wind", "impratio")
 """Options of MuJoCo that a robot's model decides, beside the flags that disable a part of it."""
-
 
 _SIZES = ("memory", "njmax", "nconmax", "nstack")
 """Sizes of MuJoCo's memory, of which the scene has its own."""
@@ -70,15 +49,23 @@ def load_spec(robot: MjcfRobotConfig) -> mujoco.MjSpec:
             robot, "this process has not read this model: load a configuration that names its file"
         )
     try:
-        spec = _parse(robot.file, files)
+        spec = parse_model(robot.file, files)
         spec.copy().compile()
     except (ValueError, mujoco.FatalError) as error:
         raise RobotFileError(robot, f"MuJoCo refuses it: {error}") from None
     return spec
 
 
-def _parse(file: str, files: Mapping[str, bytes]) -> mujoco.MjSpec:
-    """Return the model of a file and of those that it names."""
+def parse_model(file: str, files: Mapping[str, bytes]) -> mujoco.MjSpec:
+    """Return the model of a file and of those that it names.
+
+    Args:
+      file: name of the model.
+      files: its content, and that of the files that it names.
+
+    Raises:
+      ValueError: MuJoCo refuses it.
+    """
     # MuJoCo refuses a name that is in both, also if the folders differ.
     models = {name: content for name, content in files.items() if name.endswith(".xml")}
     assets = {name: content for name, content in files.items() if name not in models}
@@ -212,278 +199,3 @@ def _ahead(down: float) -> Float[np.ndarray, "4"]:
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, axes.ravel())
     return quat
-
-
-def find_drive(robot: MjcfRobotConfig, task: TaskConfig, model: mujoco.MjModel) -> Drive:
-    """Find the wheels of a robot, and what an action means for each.
-
-    Args:
-      robot: the section `robot`.
-      task: the section `task`, with the limits of speed and yaw rate.
-      model: the compiled scene, with the robot.
-
-    Raises:
-      RobotFileError: an actuator or a wheel is not as it should be.
-    """
-    if robot.wheels is None:
-        return _own_drive(robot, model)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    parts = _Parts(robot, model, data)
-    wheels = parts.wheels(robot.wheels, "wheels")
-    steered = () if robot.steering is None else parts.wheels(robot.steering, "steering")
-    parts.check_actuators((*wheels, *steered))
-    radius = float(np.mean([one.radius for one in wheels]))
-    if not steered:
-        apart = float(np.mean([2.0 * abs(one.y) for one in wheels]))
-        return DifferentialDrive(
-            task.max_speed,
-            task.max_yaw_rate,
-            radius,
-            robot.wheel_separation or apart,
-            tuple(sorted(wheels)),
-        )
-    rear = parts.rear(wheels, steered)
-    angles = parts.limits(steered)
-    curvature = largest_curvature(steered, rear, angles)
-    return AckermannDrive(task.max_speed, curvature, radius, rear, wheels, steered)
-
-
-def _own_drive(robot: MjcfRobotConfig, model: mujoco.MjModel) -> OwnDrive:
-    """Return the drive that is a function in a file beside the model."""
-    file, _, name = robot.drive.partition(":")
-    module = types.ModuleType(file.removesuffix(".py"))
-    try:
-        exec(compile((model_files(robot.sha256) or {})[file], file, "exec"), module.__dict__)
-        drive = OwnDrive(getattr(module, name), robot.action_size)
-        action = jax.ShapeDtypeStruct((robot.action_size,), jnp.float32)
-        shape = jax.eval_shape(drive.controls, action).shape
-    # It is the user's code: whatever it raises belongs into the one line.
-    except (Exception, SystemExit) as error:
-        reason = f"{type(error).__name__}: {error}"
-        raise RobotFileError(robot, f"robot.drive = {robot.drive!r}: {reason}") from None
-    if shape != (model.nu,):
-        raise RobotFileError(
-            robot,
-            f"robot.drive = {robot.drive!r} returns the shape {list(shape)}: the model has"
-            f" {model.nu} actuators",
-        )
-    return drive
-
-
-class _Parts:
-    """The parts of a robot in its initial pose."""
-
-    def __init__(self, robot: MjcfRobotConfig, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        self._robot, self._model, self._data = robot, model, data
-        self._base = model.jnt_bodyid[0]
-        self._rotation = data.xmat[self._base].reshape(3, 3)
-
-    def _error(self, key: str, reason: str) -> RobotFileError:
-        return RobotFileError(self._robot, f"robot.{key}: {reason}")
-
-    def wheels(self, sides: Sides, key: str) -> tuple[Wheel, ...]:
-        """Return the wheels of both sides."""
-        found = {
-            side: [self._wheel(name, f"{key}.{side}") for name in getattr(sides, side)]
-            for side in ("left", "right")
-        }
-        if shared := {*sides.left} & {*sides.right}:
-            raise self._error(key, f"{', '.join(sorted(shared))} is on both sides")
-        for side, names in (("left", sides.left), ("right", sides.right)):
-            if twice := {name for name in names if names.count(name) > 1}:
-                raise self._error(f"{key}.{side}", f"{', '.join(sorted(twice))} is named twice")
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            for name, wheel in zip(getattr(sides, side), found[side], strict=True):
-                if sign * wheel.y <= 0:
-                    raise self._error(
-                        f"{key}.{side}",
-                        f"{name} is {abs(wheel.y):.3g} m to the"
-                        f" {'right' if side == 'left' else 'left'} of the base: swap the sides, or"
-                        " turn the base so that x is forward",
-                    )
-        both = (*found["left"], *found["right"])
-        radii = [one.radius for one in both]
-        if max(radii) - min(radii) > 0.01 * max(radii):
-            raise self._error(key, f"wheels of {min(radii):g} and {max(radii):g} m: give them one")
-        return both
-
-    def check_actuators(self, wheels: Sequence[Wheel]) -> None:
-        """Check that every actuator is of one wheel."""
-        named, model = {one.actuator for one in wheels}, self._model
-        if left := [model.actuator(i).name for i in range(model.nu) if i not in named]:
-            names = ", ".join(name.removeprefix(PREFIX) or "one without a name" for name in left)
-            raise RobotFileError(
-                self._robot,
-                f"no wheel has the actuator {names}: name it in robot.wheels or robot.steering, or"
-                " leave it out of the model",
-            )
-
-    def limits(self, steered: Sequence[Wheel]) -> Float[np.ndarray, " n"]:
-        """Return the largest angle of each steered wheel [rad]."""
-        angles, model = [], self._model
-        for one in steered:
-            name = model.actuator(one.actuator).name.removeprefix(PREFIX)
-            if not model.actuator_ctrllimited[one.actuator]:
-                raise self._error("steering", f"{name} has no limits: give it a ctrlrange [rad]")
-            angles.append(np.abs(model.actuator_ctrlrange[one.actuator] / one.gain).min())
-        if min(angles) < 0.02 or max(angles) > 1.4:
-            raise self._error(
-                "steering",
-                f"angles of {min(angles):.3g} to {max(angles):.3g} rad: 0.02 to 1.4 are"
-                " right, and a ctrlrange is in radians",
-            )
-        joints = [self._joint(one.actuator) for one in steered]
-        stops = np.abs(model.jnt_range[joints]).min(axis=1)
-        return np.minimum(angles, np.where(model.jnt_limited[joints], stops, np.inf))
-
-    def rear(self, driven: Sequence[Wheel], steered: Sequence[Wheel]) -> float:
-        """Return how far ahead of the base the wheels are that do not turn to the side [m].
-
-        Those are the driven ones, else, of a car with front-wheel drive, those without an actuator.
-        Of a car that steers all wheels, the rear ones then stay straight.
-        """
-        model = self._model
-        turning = {model.jnt_bodyid[self._joint(one.actuator)] for one in steered}
-        hinges = [
-            joint
-            for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).tolist()
-            if abs(self._axis(joint)[1]) > _PARALLEL and not self._is_on(joint, turning)
-        ]
-        of_motors = [one for one in hinges if one in {self._joint(x.actuator) for x in driven}]
-        still = [self._place(joint)[0] for joint in of_motors or hinges]
-        return float(np.mean(still or [min(one.x for one in steered)]))
-
-    def _is_on(self, joint: int, bodies: Collection[int]) -> bool:
-        """Return whether a joint's body is one of some bodies, or on one."""
-        body = self._model.jnt_bodyid[joint]
-        while body and body not in bodies:
-            body = self._model.body_parentid[body]
-        return body in bodies
-
-    def _axis(self, joint: int) -> Float[np.ndarray, "3"]:
-        """Return the axis of a joint in the frame of the base."""
-        return self._rotation.T @ self._data.xaxis[joint]
-
-    def _place(self, joint: int) -> Float[np.ndarray, "3"]:
-        """Return the place of a joint in the frame of the base [m]."""
-        return self._rotation.T @ (self._data.xanchor[joint] - self._data.xpos[self._base])
-
-    def _joint(self, actuator: int) -> int:
-        return self._model.actuator_trnid[actuator, 0]
-
-    def _joint_name(self, joint: int) -> str:
-        return self._model.joint(joint).name.removeprefix(PREFIX) or f"joint {joint}"
-
-    def _wheel(self, name: str, key: str) -> Wheel:
-        """Return a wheel by the name of its actuator."""
-        model = self._model
-        names = [model.actuator(i).name.removeprefix(PREFIX) for i in range(model.nu)]
-        if name not in names:
-            close = difflib.get_close_matches(name, names, 1)
-            hint = (
-                f"did you mean {close[0]}?" if close else f"there are {', '.join(names) or 'none'}"
-            )
-            raise self._error(key, f"the model has no actuator {name!r}: {hint}")
-        index = names.index(name)
-        if model.actuator_trntype[index] != mujoco.mjtTrn.mjTRN_JOINT:
-            raise self._error(key, f"{name} drives no joint: give it joint=…")
-        if model.actuator_dyntype[index] != mujoco.mjtDyn.mjDYN_NONE:
-            raise self._error(key, f"{name} has a state of its own (dyntype): leave it out")
-        joint = self._joint(index)
-        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise self._error(key, f"{name} drives {self._joint_name(joint)}, which is no hinge")
-        steers = key.startswith("steering")
-        self._check_servo(index, name, key, steers=steers)
-        axis, place = self._axis(joint), self._place(joint)
-        along = axis[2 if steers else 1]
-        if abs(along) < _PARALLEL:
-            wanted = "up (0 0 1)" if steers else "to the left (0 1 0)"
-            raise self._error(
-                key,
-                f"the axis of {self._joint_name(joint)} is {_numbers(axis)} in the frame of the"
-                f" base: it should point {wanted}, where x is forward",
-            )
-        gear = model.actuator_gear[index, 0]
-        radius = 0.0 if steers else self._radius(int(model.jnt_bodyid[joint]), axis, name, key)
-        return Wheel(index, float(place[0]), float(place[1]), float(np.sign(along) * gear), radius)
-
-    def _check_servo(self, index: int, name: str, key: str, *, steers: bool) -> None:
-        """Check that an actuator takes a speed or an angle as its control."""
-        gain, bias = self._model.actuator_gainprm[index, 0], self._model.actuator_biasprm[index]
-        follows = bias[1] if steers else bias[2]
-        if gain <= 0 or not np.isclose(follows, -gain) or (not steers and bias[1] != 0):
-            kind = "<position kp=… ctrlrange=…>" if steers else "<velocity kv=… forcerange=…>"
-            what = "an angle" if steers else "a wheel speed"
-            raise self._error(key, f"{name} does not take {what} as its control: make it {kind}")
-
-    def _radius(self, body: int, axis: Float[np.ndarray, "3"], name: str, key: str) -> float:
-        """Return the radius of a wheel [m]."""
-        if self._robot.wheel_radius is not None:
-            return self._robot.wheel_radius
-        model = self._model
-        paired = {*model.pair_geom1, *model.pair_geom2}
-        radii = []
-        for geom in np.flatnonzero(model.geom_bodyid == body):
-            if not (model.geom_contype[geom] or model.geom_conaffinity[geom] or geom in paired):
-                continue
-            kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
-            own = self._rotation.T @ self._data.geom_xmat[geom].reshape(3, 3)
-            if kind in _ROLLING:
-                radii.append(size[0] if kind == mujoco.mjtGeom.mjGEOM_SPHERE else max(size))
-            elif kind in _LONG and abs(own[:, 2] @ axis) > _PARALLEL:
-                radii.append(size[0])
-        if not radii:
-            raise self._error(
-                key,
-                f"{name} has no sphere, ellipsoid, cylinder or capsule around its axis that touches"
-                " the floor: add one, or set robot.wheel_radius",
-            )
-        if max(radii) > _LARGEST_RADIUS:
-            raise self._error(
-                key,
-                f"the wheel of {name} has a radius of {max(radii):g} m: lengths are in metres"
-                " (millimetres are metres × 0.001)",
-            )
-        return float(max(radii))
-
-
-def _numbers(vector: Float[np.ndarray, "3"]) -> str:
-    return f"({' '.join(f'{x:.2g}' for x in np.round(vector, 3) + 0.0)})"
-
-
-def guess_section(file: str, files: Mapping[str, bytes]) -> dict[str, object]:
-    """Return a section `robot` for a model: its actuators by what they turn, and by their side.
-
-    Args:
-      file: name of the model.
-      files: its content, and that of the files that it names.
-
-    Returns:
-      The section; empty where no actuator turns a wheel, or the model cannot be compiled.
-    """
-    try:
-        model = _parse(file, files).compile()
-    except (ValueError, mujoco.FatalError):
-        return {}
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    base = model.jnt_bodyid[free[0]] if free.size else 0
-    rotation = data.xmat[base].reshape(3, 3)
-    parts: dict[str, dict[str, list[str]]] = {"wheels": {}, "steering": {}}
-    for index in range(model.nu):
-        joint = model.actuator_trnid[index, 0]
-        if model.actuator_trntype[index] != mujoco.mjtTrn.mjTRN_JOINT:
-            continue
-        axis = rotation.T @ data.xaxis[joint]
-        left = (rotation.T @ (data.xanchor[joint] - data.xpos[base]))[1] > 0
-        kind = "steering" if abs(axis[2]) > _PARALLEL else "wheels"
-        side = "left" if left else "right"
-        parts[kind].setdefault(side, []).append(model.actuator(index).name)
-    if set(parts["wheels"]) != {"left", "right"}:
-        return {}
-    section: dict[str, object] = {"file": file, "wheels": parts["wheels"]}
-    if set(parts["steering"]) == {"left", "right"}:
-        section |= {"drive": "ackermann", "steering": parts["steering"]}
-    return section

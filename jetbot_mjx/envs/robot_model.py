@@ -13,6 +13,7 @@ import numpy as np
 
 from jetbot_mjx.config import MjcfRobotConfig, PhysicsConfig, RobotConfig, TaskConfig
 from jetbot_mjx.envs import mjcf_robot
+from jetbot_mjx.envs.mjcf_wheels import find_drive
 from jetbot_mjx.errors import UserError
 
 _LARGEST_LEAN = np.radians(15.0)  # SIM: further over, the camera and the chassis are elsewhere
@@ -63,7 +64,7 @@ def make_mj_model(
         _remove_jetbot(spec)
         mjcf_robot.add_robot(spec, robot)
         # What is wrong with a wheel would otherwise be told as a robot that does not rest.
-        mjcf_robot.find_drive(robot, TaskConfig(), spec.compile())
+        find_drive(robot, TaskConfig(), spec.compile())
     else:
         _check_stable(robot, physics)
         _scale_looks(spec, robot)

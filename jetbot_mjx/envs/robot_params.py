@@ -40,15 +40,7 @@ def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, robot_params: RobotPa
         tangential = wheels[:, None] & (np.arange(5) < 2)
         factor = jnp.where(tangential, robot_params.friction, 1.0)
         changed["pair_friction"] = model.pair_friction * factor
-    # Mass and centre of mass of the chassis.
-    chassis = np.arange(model.nbody) == mj_model.body(_CHASSIS).id
-    if robot_params.differs("mass"):
-        mass = jnp.where(chassis, robot_params.mass, 1.0)
-        changed["body_mass"] = model.body_mass * mass
-        changed["body_inertia"] = model.body_inertia * mass[:, None]
-    if robot_params.differs(*_COM):
-        shift = jnp.where(chassis[:, None], _com_shift(robot_params), 0.0)
-        changed["body_ipos"] = model.body_ipos + shift
+    changed |= _chassis(model, robot_params)
     if robot_params.differs("mass", *_COM):
         changed["body_invweight0"] = _invweights(model, mj_model, robot_params)
     return model.replace(**changed)
@@ -70,6 +62,12 @@ def vary_own_model(model: mjx.Model, robot_params: RobotParams) -> mjx.Model:
             values = getattr(model, name)
             sliding = np.arange(values.shape[1]) < (1 if name == "geom_friction" else 2)
             changed[name] = values * jnp.where(sliding, robot_params.friction, 1.0)
+    return model.replace(**changed, **_chassis(model, robot_params))
+
+
+def _chassis(model: mjx.Model, robot_params: RobotParams) -> dict[str, Array]:
+    """Return the arrays of a model with another mass and centre of mass of the robot's body."""
+    changed = {}
     body = np.arange(model.nbody) == model.jnt_bodyid[0]
     if robot_params.differs("mass"):
         mass = jnp.where(body, robot_params.mass, 1.0)
@@ -78,7 +76,7 @@ def vary_own_model(model: mjx.Model, robot_params: RobotParams) -> mjx.Model:
     if robot_params.differs(*_COM):
         shift = jnp.where(body[:, None], _com_shift(robot_params), 0.0)
         changed["body_ipos"] = model.body_ipos + shift
-    return model.replace(**changed)
+    return changed
 
 
 def _com_shift(robot_params: RobotParams) -> Float[Array, "3"]:

@@ -3,7 +3,7 @@
 import pytest
 
 from helpers import gliding
-from helpers.own_robots import TINY
+from helpers.tiny import TINY
 from jetbot_mjx import check_robot, new_robot
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs import write_robot_template

@@ -3,26 +3,12 @@
 import pytest
 
 from helpers import gliding
+from helpers.tiny import TINY
 from jetbot_mjx import check_env, new_task
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs import write_task_template
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.training import session
-
-# So small that compiling is all that takes time.
-TINY = (
-    "checkpoint_interval=1024",
-    "task.episode_length=16",
-    "ppo.num_timesteps=1024",
-    "ppo.num_envs=32",
-    "ppo.unroll_length=8",
-    "ppo.batch_size=16",
-    "ppo.num_minibatches=2",
-    "ppo.num_updates_per_batch=1",
-    "ppo.network.policy_hidden_layer_sizes=[8]",
-    "ppo.network.value_hidden_layer_sizes=[8]",
-    "evaluation.episodes=4",
-)
 
 
 def test_what_is_written_passes_the_checks_and_trains(tmp_path, capsys):

@@ -9,13 +9,17 @@ import jax
 import numpy as np
 import pytest
 
-from helpers.own_robots import TINY, copy_robot, load_robot
+from helpers.own_robots import copy_robot, load_robot
+from helpers.tiny import TINY
 from jetbot_mjx import evaluate, export, render
 from jetbot_mjx.config import MjcfRobotConfig, load_config, robot_files
 from jetbot_mjx.config.robot_mjcf import OF_CARS
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import checkpoint_steps, load_checkpoint, stored_config
 from jetbot_mjx.training import session
+
+SETTINGS = (*TINY, "ppo.learning_rate_schedule=NONE")
+"""A training that may go on for longer than it was to, and be the same until then."""
 
 MEASURES = """
 robot: {preset: real, wheel_radius: 0.04, wheel_separation: 0.15, chassis_mass: 0.9}
@@ -50,7 +54,7 @@ def trained(request, tmp_path_factory):
         (folder / "wheels.py").write_text("def controls(action): return 10.0 * action")
         own = {"drive": "wheels.py:controls", "action_size": 4, "wheels": None}
         config = copy_robot(folder, "rover", settings=own)
-    session.run(load_config(config, TINY), folder / "run")
+    session.run(load_config(config, SETTINGS), folder / "run")
     for file in folder.glob("*.*"):
         file.unlink()
     with pytest.MonkeyPatch.context() as patch:
@@ -130,7 +134,7 @@ def test_a_training_that_is_killed_ends_with_the_same_bits(kind, tmp_path):
     config.write_text(MEASURES)
     if kind != "measures":
         config = copy_robot(tmp_path, kind)
-    settings = [word for one in (*TINY, "ppo.num_timesteps=65536") for word in ("--set", one)]
+    settings = [word for one in (*SETTINGS, "ppo.num_timesteps=65536") for word in ("--set", one)]
 
     def start(name):
         program = [sys.executable, "-m", "jetbot_mjx.train", str(config), *settings]

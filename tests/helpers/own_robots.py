@@ -9,22 +9,6 @@ from jetbot_mjx.config import load_config
 EXAMPLES = Path(__file__).parents[2] / "examples"
 OWN_ROBOTS = ("turtlebot", "rover", "car")
 
-# So small that compiling is all that takes time.
-TINY = (
-    "checkpoint_interval=1024",
-    "task.episode_length=16",
-    "ppo.num_timesteps=2048",
-    "ppo.learning_rate_schedule=NONE",
-    "ppo.num_envs=32",
-    "ppo.unroll_length=8",
-    "ppo.batch_size=16",
-    "ppo.num_minibatches=2",
-    "ppo.num_updates_per_batch=1",
-    "ppo.network.policy_hidden_layer_sizes=[8]",
-    "ppo.network.value_hidden_layer_sizes=[8]",
-    "evaluation.episodes=4",
-)
-
 
 def copy_robot(folder, name, changes=(), settings=None):
     """Write an example's model and settings, changed, into a folder; returns the configuration."""

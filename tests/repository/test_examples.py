@@ -9,6 +9,7 @@ import pytest
 
 import jetbot_mjx
 from helpers import gliding
+from helpers.tiny import TINY
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
@@ -18,21 +19,6 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import evaluate_run
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.training import session
-
-# So small that compiling is all that takes time.
-TINY = (
-    "checkpoint_interval=1024",
-    "task.episode_length=16",
-    "ppo.num_timesteps=2048",
-    "ppo.num_envs=32",
-    "ppo.unroll_length=8",
-    "ppo.batch_size=16",
-    "ppo.num_minibatches=2",
-    "ppo.num_updates_per_batch=1",
-    "ppo.network.policy_hidden_layer_sizes=[8]",
-    "ppo.network.value_hidden_layer_sizes=[8]",
-    "evaluation.episodes=4",
-)
 
 
 @pytest.fixture(scope="module")

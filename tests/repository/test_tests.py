@@ -46,6 +46,7 @@ TOGETHER = {
     "envs/camera/test_pictures": "envs.camera.geometry envs.camera.pixel envs.camera.render",
     "envs/test_checks": "envs.checks",
     "envs/test_jetbot_env": "envs.state",
+    "envs/test_mjcf_robot": "envs.mjcf_wheels",
     "envs/test_mjx": "mjx_import",
     "evaluation/test_comparison": "evaluation.tables",
     "evaluation/test_evaluator": "evaluation.rollout",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from helpers.own_robots import copy_robot
+from helpers.own_robots import copy_robot, load_robot
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import run_dir
@@ -259,3 +259,11 @@ def test_a_run_without_its_robot_says_which_file_is_missing(tmp_path):
     (tmp_path / "run" / "config.yaml").write_text(text)
     with pytest.raises(DamagedRunError, match=r"robot/turtlebot.xml does not exist"):
         read_config(tmp_path / "run")
+
+
+def test_a_runs_model_is_written_before_the_configuration_that_names_it(tmp_path, monkeypatch):
+    config = load_robot("rover")
+    monkeypatch.setattr(run_dir, "write_text", lambda path, text: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_dir.write_run(tmp_path, config, {})
+    assert (tmp_path / "robot" / "rover.xml").is_file()
