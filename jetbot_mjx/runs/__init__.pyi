@@ -44,6 +44,7 @@ from .run_dir import stored_config as stored_config
 from .run_dir import versions as versions
 from .run_dir import write_bytes as write_bytes
 from .run_dir import write_json as write_json
+from .run_dir import write_model as write_model
 from .run_dir import write_run as write_run
 from .run_dir import write_text as write_text
 from .run_dir import writing_to as writing_to

@@ -217,17 +217,24 @@ def write_run(run_dir: Path, config: Config, made_with: JsonObject) -> None:
     """
     with writing_to(run_dir):
         # A folder counts as a run by its configuration: first what that needs.
-        if isinstance(config.robot, MjcfRobotConfig):
-            _write_model(run_dir / FOLDER, config.robot)
+        write_model(run_dir, config)
         write_text(run_dir / CONFIG, config.to_yaml())
         write_json(run_dir / _VERSIONS, made_with)
 
 
-def _write_model(folder: Path, robot: MjcfRobotConfig) -> None:
-    """Write the files of a robot's model."""
-    for name, content in (model_files(robot.sha256) or {}).items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(folder / name, content)
+def write_model(folder: Path, config: Config) -> None:
+    """Write the files of the robot's model, if it is one, to where a configuration finds them.
+
+    Args:
+      folder: the folder of the configuration.
+      config: the configuration.
+    """
+    if not isinstance(config.robot, MjcfRobotConfig):
+        return
+    for name, content in (model_files(config.robot.sha256) or {}).items():
+        file = folder / FOLDER / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(file, content)
 
 
 def _read_model(run_dir: Path, robot: MjcfRobotConfig) -> None:

@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import requires_extra
-from jetbot_mjx.runs import write_text, writing_to
+from jetbot_mjx.runs import write_model, write_text, writing_to
 from jetbot_mjx.terminal import process_seconds, stage
 from jetbot_mjx.tuning.search import (
     CONFIRM_SEEDS,
@@ -119,7 +119,7 @@ def best_values(search: Search, entrants: Sequence[Entrant]) -> Values:
 def write_results(
     folder: Path, config: Config, search: Search, entrants: Sequence[Entrant]
 ) -> Path:
-    """Write `best.yaml`, `trials.csv`, `trials.md` and the plots.
+    """Write `best.yaml`, `trials.csv`, `trials.md` and the plots, and a model of the robot.
 
     Args:
       folder: an existing folder.
@@ -137,6 +137,7 @@ def write_results(
     path = folder / "best.yaml"
     tables = [*([entrants_table(entrants)] if entrants else []), _trials_table(study)]
     with writing_to(folder):
+        write_model(folder, config)
         write_text(
             path, with_values(config, best_values(search, entrants), source="tune").to_yaml()
         )

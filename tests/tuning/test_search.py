@@ -8,9 +8,10 @@ import optuna
 import pytest
 import sqlalchemy.exc
 
+from helpers.own_robots import load_robot
 from helpers.quick_trials import Quick
 from helpers.stages import noted_stages
-from jetbot_mjx.config import load_config, parse_config
+from jetbot_mjx.config import load_config, parse_config, robot_files
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.terminal import progress
 from jetbot_mjx.tuning import results, search
@@ -272,6 +273,16 @@ def test_without_final_trainings_the_best_trial_is_the_best(tmp_path):
     best = one.study.best_trial.params["ppo.learning_rate"]
     assert load_config(path).ppo.learning_rate == best
     assert (tmp_path / "trials.md").read_text().startswith("| trial |")
+
+
+def test_the_best_configuration_has_its_robots_model_beside_it(tmp_path, monkeypatch):
+    config = load_robot("car")
+    one = search.Search(config, SPACE[:1], tmp_path / "s")
+    one.run(2, 2)
+    path = results.write_results(tmp_path, config, one, [])
+    monkeypatch.setattr(robot_files, "_MODELS", {})  # as in another process
+    assert load_config(path).robot == config.robot
+    assert robot_files.model_files(config.robot.sha256)
 
 
 def test_a_storage_that_cannot_be_used_is_named(tmp_path):
