@@ -59,7 +59,7 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
             f"overrides = {shown(overrides)} is wrong: give settings and values, as in"
             " {'ppo.num_envs': 256}"
         )
-    overrides = _robots_first(overrides, values)
+    _forget_robot(values, overrides)
     if isinstance(overrides, Mapping):
         name += f" with {shown(dict(overrides))}" if overrides else ""
         for key, value in overrides.items():
@@ -106,21 +106,14 @@ def _with_robot_of_file(values: Mapping[str, object]) -> Mapping[str, object]:
     return with_defaults(values, defaults)
 
 
-def _robots_first(overrides: Overrides, values: dict[str, object]) -> Overrides:
-    """Return overrides with the choice of a robot before its measures.
-
-    Another robot than that of a stored configuration, which has all measures, has its own ones.
-    """
-    chosen = [x for x in overrides if _key_of(x) in ("robot.preset", "robot.file")]
+def _forget_robot(values: dict[str, object], overrides: Overrides) -> None:
+    """Leave out what a stored configuration knows of its robot, where another one is chosen."""
     robot = values.get("robot")
+    chosen = {"robot.preset", "robot.file"} & {_key_of(one) for one in overrides}
     if chosen and isinstance(robot, dict):
         robot.pop("sha256", None)
-    if chosen and isinstance(robot, dict) and RobotConfig.model_fields.keys() <= robot.keys():
-        del values["robot"]
-    others = [x for x in overrides if x not in chosen]
-    if isinstance(overrides, Mapping):
-        return {key: overrides[key] for key in (*chosen, *others)}
-    return [*chosen, *others]
+        if RobotConfig.model_fields.keys() <= robot.keys():
+            del values["robot"]
 
 
 def _key_of(override: object) -> str:

@@ -1,5 +1,7 @@
 """`check_robot` tells what a robot is, how it follows its commands, and what is wrong with it."""
 
+import re
+
 import pytest
 
 from helpers.own_robots import EXAMPLES, copy_robot
@@ -24,7 +26,9 @@ def test_a_configuration_is_checked_with_its_settings(checked):
     assert "rover: 3.2 kg" in printed
     assert "0.79 m/s of task.max_speed = 0.8" in printed
     assert "wheels of 50 mm, 200 mm apart for the controller" in printed
-    assert "would make that 100 %" in printed
+    turn = int(re.search(r"turn +(\d+)%", printed)[1])
+    better = float(re.search(r"robot.wheel_separation = (\S+) would make that 100 %", printed)[1])
+    assert better == pytest.approx(0.2 / (turn / 100), rel=0.03)
 
 
 def test_of_a_model_alone_the_parts_are_guessed_and_printed(checked):

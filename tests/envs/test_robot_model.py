@@ -6,6 +6,7 @@ import pytest
 
 from jetbot_mjx.config import PhysicsConfig, RobotConfig
 from jetbot_mjx.envs.robot_model import make_mj_model
+from jetbot_mjx.errors import UserError
 
 
 @pytest.fixture(params=["isaac", "real"])
@@ -119,3 +120,20 @@ def test_friction_is_a_number_of_the_robot():
     slippery = RobotConfig(preset="real", friction=0.4)
     compiled = make_mj_model(slippery, PhysicsConfig())
     np.testing.assert_allclose(compiled.pair("left_wheel").friction[:2], 0.4)
+
+
+def test_what_shows_has_the_size_of_the_measures():
+    wide = {"chassis_size": (0.272, 0.18, 0.108), "wheel_radius": 0.065, "wheel_width": 0.039}
+    plain, large = (
+        make_mj_model(RobotConfig(**measures), PhysicsConfig()) for measures in ({}, wide)
+    )
+    for name in ("tray", "left_tyre", "left_spoke_1"):
+        ratio = large.geom(name).size / np.maximum(plain.geom(name).size, 1e-9)
+        np.testing.assert_allclose(ratio[plain.geom(name).size > 0], 2.0)
+    np.testing.assert_allclose(large.geom("tray").pos, 2 * plain.geom("tray").pos)
+
+
+def test_a_robot_that_leans_is_refused():
+    casters = [{"x": -0.082, "y": 0.0, "radius": 0.01, "clearance": 0.03}]
+    with pytest.raises(UserError, match=r"leans 2.° to the rear: support it there"):
+        make_mj_model(RobotConfig(preset="real", casters=casters), PhysicsConfig())
