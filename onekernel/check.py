@@ -62,7 +62,7 @@ def check(kernel: Kernel, arguments: Sequence[np.dtype], results: Sequence[np.dt
         shaken = [_run(with_noise, [seed, *drawn], results) for seed in seeds]
     for place, (one, other) in enumerate(zip(ours, theirs, strict=True)):
         others = [x[place] for x in shaken]
-        wrong = differ(one, other, [*others, _decided(other, others)], _AMPLIFICATION)
+        wrong = differ(one, other, [*others, _decided(other, others)], _AMPLIFICATION, _size(other))
         if wrong.any():
             # Name the first number that differs.
             at = tuple(np.argwhere(wrong)[0].tolist())
@@ -99,7 +99,11 @@ def _run(
 
 
 def differ(
-    one: np.ndarray, other: np.ndarray, shaken: Sequence[np.ndarray], amplification: float
+    one: np.ndarray,
+    other: np.ndarray,
+    shaken: Sequence[np.ndarray],
+    amplification: float,
+    size: np.ndarray,
 ) -> np.ndarray:
     """Return which numbers differ by more than round-off.
 
@@ -108,6 +112,8 @@ def differ(
       other: what it should be.
       shaken: the same as `other`, each computed with other round-off.
       amplification: multiple of the largest difference between those and `other` that is allowed.
+      size: how large the numbers are in the instances together, (...): a number that is a thousand
+        times smaller may differ as one of a thousandth of that.
 
     Returns:
       Truth values of the shape of `one`.
@@ -118,8 +124,8 @@ def differ(
         return steady & (one != other)
     with np.errstate(invalid="ignore", over="ignore"):
         spread = np.max([np.abs(x.astype(np.float64) - other) for x in shaken], axis=0)
-        size = np.maximum(np.abs(other), np.maximum(1e-3 * _size(other), 1e-30))
-        allowed = _ROUNDING * size + amplification * spread
+        scale = np.maximum(np.abs(other), np.maximum(1e-3 * size, 1e-30))
+        allowed = _ROUNDING * scale + amplification * spread
         close = np.abs(one.astype(np.float64) - other) <= allowed
     same = (one == other) | (np.isnan(one) & np.isnan(other))
     # A result that is finite in some evaluations only is as unsteady as one that varies.
