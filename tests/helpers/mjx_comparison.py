@@ -5,8 +5,9 @@ that stops an iteration earlier, a matrix that is nearly singular. How much it d
 in one way for all models: XLA also steps states each number of which is shaken by one unit in its
 last place. Shaking does not move what the solver's cost decides: MJX takes a step only if float32
 tells its cost from the one before. So where that is not enough, XLA computes the same step by two
-more programs, for a batch of another size and for one instance after the other. A position,
-velocity or activation of the kernel's may differ from XLA's by one of these:
+more programs, for a batch of another size and for one instance after the other, and at last with
+noise in every operation. A position, velocity or activation of the kernel's may differ from XLA's
+by one of these:
 
 - `PLAIN` of the largest number of all instances,
 - as much as XLA's results differ among each other,
@@ -30,6 +31,7 @@ PLAIN = 1e-6
 CONVERGED = 1e-5
 FORCES = 10
 SHAKES = 32
+NOISES = 8
 LARGEST = 1e3
 """Of positions [m, rad] and velocities [m/s, rad/s] after a step."""
 MOVES = ("qpos", "qvel", "act")
@@ -98,6 +100,12 @@ def differences(model, before, by_c, ctrl):
     if not all(x.is_round_off for x in compare()):
         first = batch_of(step, before)
         others += [by_mjx(step, first, ctrl), by_mjx(step, first, ctrl, batched=False)]
+    if not all(x.is_round_off for x in compare()):
+        seeds = rng.integers(1, 2**32, (NOISES, count), np.uint32)
+        repeated = jax.tree.map(lambda x: np.concatenate([x] * NOISES), (before, ctrl))
+        made = by_mjx(step, batch_of(step, repeated[0]), repeated[1], noise=seeds.ravel())
+        parts = {name: np.split(made[name], NOISES) for name in fields}
+        others += [{name: one[i] for name, one in parts.items()} for i in range(NOISES)]
     return compare()
 
 

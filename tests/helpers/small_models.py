@@ -6,6 +6,8 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from onekernel.round_off import noisy
+
 CART_POLE = """
 <mujoco>
   <option timestep="0.01"/>
@@ -131,7 +133,7 @@ def batch_of(step, states):
     return made.replace(**{name: jnp.asarray(x) for name, x in states.items()})
 
 
-def by_mjx(step, states, ctrl, *, batched=True):
+def by_mjx(step, states, ctrl, *, batched=True, noise=None):
     """Return what one physics step of `mjx.step` makes of states, compiled by XLA.
 
     Args:
@@ -139,6 +141,7 @@ def by_mjx(step, states, ctrl, *, batched=True):
       states: the states of several instances.
       ctrl: their controls.
       batched: whether all instances are stepped at once, or one after the other.
+      noise: a seed for each instance, for noise in every operation; None: there is none.
 
     Returns:
       The next states' fields, and the sensors of the states given under "sensordata", which MJX
@@ -156,6 +159,12 @@ def by_mjx(step, states, ctrl, *, batched=True):
     # Compile in a third of the time: the test makes one step only.
     options = {"xla_backend_optimization_level": 0}
     states, ctrl = jax.device_put((states, ctrl), jax.devices("cpu")[0])
+    if noise is not None:
+        leaves, structure = jax.tree.flatten((states, ctrl))
+        many = jax.vmap(noisy(lambda *x: jax.tree.leaves(one(*structure.unflatten(x)))))
+        after = jax.jit(many, compiler_options=options)(noise, *leaves)
+        made = jax.eval_shape(jax.vmap(one), states, ctrl)
+        return jax.tree.unflatten(jax.tree.structure(made), map(np.asarray, after))
     many = jax.vmap(one) if batched else lambda *x: jax.lax.map(lambda each: one(*each), x)
     after = jax.jit(many, compiler_options=options)(states, ctrl)
     return jax.tree.map(np.asarray, after)
