@@ -30,7 +30,7 @@ from .mujoco_simulator import Numerics as Numerics
 from .mujoco_simulator import in_mujoco as in_mujoco
 from .opengl import SceneRenderer as SceneRenderer
 from .opengl import find_backend as find_backend
-from .program_key import BUILT_IN_TASKS as BUILT_IN_TASKS
+from .program_key import is_built_in as is_built_in
 from .program_key import open_program_cache as open_program_cache
 from .robot_facts import describe_robot as describe_robot
 from .robot_facts import step_rate as step_rate

@@ -45,6 +45,11 @@ SOURCES = {".ll", ".py", ".pyi", ".xml", ".yaml"}
 """Suffixes of the files from which programs are made; a `.pyi` says what a face exports."""
 
 
+def is_built_in(task: str) -> bool:
+    """Say whether a task, named as in `task.name`, is this package's own."""
+    return task in BUILT_IN_TASKS
+
+
 def open_program_cache(config: Config, *, keep: bool = True) -> onekernel.ProgramCache:
     """Open the cache of a configuration's programs.
 
@@ -57,7 +62,7 @@ def open_program_cache(config: Config, *, keep: bool = True) -> onekernel.Progra
       package's, and if several processes train together.
     """
     folder = jax.config.values["jax_compilation_cache_dir"]
-    kept = keep and folder and config.task.name in BUILT_IN_TASKS and jax.process_count() == 1
+    kept = keep and folder and is_built_in(config.task.name) and jax.process_count() == 1
     return onekernel.ProgramCache(
         compiler_options(config.deterministic),
         Path(folder) if kept else None,

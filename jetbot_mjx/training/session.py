@@ -181,7 +181,7 @@ def _compose(
     run_dirs = runs.seed_dirs(run_dir, config)
     task_class, task_code = _find_task(config.task.name, run_dirs)
     setup = Setup(config, programs, task_class=task_class)
-    if config.task.name not in envs.BUILT_IN_TASKS:
+    if not envs.is_built_in(config.task.name):
         envs.require_trainable(setup.env.task, config)
     ppo = ppo_trainer.build_ppo(setup)
     # Another run's policy is loaded only for a run without checkpoints of its own.
