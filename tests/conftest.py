@@ -58,6 +58,7 @@ from helpers.durations import (  # noqa: F401
     pytest_runtest_makereport,
     pytest_terminal_summary,
 )
+from helpers.stack import OneChunk
 from helpers.unpainted import unpainted
 from jetbot_mjx import fallbacks
 from jetbot_mjx.config import Config, ConfigError, load_config, parse_config, task_modules
@@ -81,6 +82,10 @@ _LONGEST = (
     "test_eight_devices",
     "test_torture",
 )
+
+
+def pytest_configure(config):
+    config.pluginmanager.register(OneChunk())
 
 
 def pytest_collection_modifyitems(items):
