@@ -203,6 +203,15 @@ def blank_figures():
 
 
 @pytest.fixture
+def small_videos(monkeypatch):
+    """Videos have few frames, and small ones, where nobody looks at them."""
+    from jetbot_mjx.viewers import gallery, video
+
+    small = functools.partial(video.VideoRenderer, side=64, fps=2)
+    monkeypatch.setattr(gallery, "VideoRenderer", small)
+
+
+@pytest.fixture
 def write(tmp_path):
     """Writes a YAML file and gives its path."""
 

@@ -4,7 +4,6 @@ Words that set a size are replaced, nothing else; `make` is what continuous inte
 Every training compiles a program of its own, so most of this is slow: `make test-slow`.
 """
 
-import functools
 import importlib
 import re
 import runpy
@@ -25,8 +24,7 @@ from jetbot_mjx.deployment.simulated_jetbot import SimulatedJetBot
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.runs.nan_dump import save_nan_dump
-from jetbot_mjx.viewers import gallery, mujoco_window
-from jetbot_mjx.viewers.video import VideoRenderer
+from jetbot_mjx.viewers import mujoco_window
 
 TEXTS = {**PAGES, "README.md": (ROOT / "README.md").read_text("utf-8")}
 
@@ -106,15 +104,11 @@ def checkout(tmp_path_factory):
 
 
 @pytest.fixture
-def reader(checkout, monkeypatch):
+def reader(checkout, small_videos, monkeypatch):
     """Sits in the checkout, with the files that a page has its reader write."""
 
     def sit(page):
         monkeypatch.chdir(checkout)
-        # Pictures are looked at elsewhere.
-        monkeypatch.setattr(
-            gallery, "VideoRenderer", functools.partial(VideoRenderer, side=64, fps=2)
-        )
         for name, text in own_files(page).items() if page in PAGES else ():
             if name.endswith(".yaml"):
                 with Path(name).open("w") as file:

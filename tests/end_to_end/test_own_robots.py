@@ -74,6 +74,7 @@ def test_the_run_holds_what_the_robot_is(trained):
 
 
 @every_kind
+@pytest.mark.usefixtures("blank_figures", "small_videos")
 def test_it_is_evaluated_in_both_simulators_rendered_and_exported(trained, tmp_path):
     evaluate(trained, episodes=4, simulator="mujoco", output=tmp_path / "report")
     assert "in C MuJoCo" in (tmp_path / "report" / "report.md").read_text()

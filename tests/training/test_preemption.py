@@ -1,6 +1,7 @@
 """A training that is asked to stop saves in time in every phase, and resumes."""
 
 import contextlib
+import itertools
 import os
 import re
 import shutil
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -263,14 +265,18 @@ def listen(program, notice=300, stderr=subprocess.PIPE):
     return process.returncode, time.monotonic() - began, told
 
 
-@pytest.fixture(params=["full", "nobody reads", "nobody reads on"])
-def unwritable(request):
+UNWRITABLE = ("full", "nobody reads", "nobody reads on")
+SECOND = {"second signal": "send()", "notice": ""}
+
+
+@contextlib.contextmanager
+def unwritable(kind):
     """Standard error that takes nothing: at the end of a full pipe a write waits for ever."""
     reader, writer = os.pipe()
-    if request.param == "full":
+    if kind == "full":
         os.close(writer)
         writer = os.open("/dev/full", os.O_WRONLY)
-    elif request.param == "nobody reads on":
+    elif kind == "nobody reads on":
         os.set_blocking(writer, False)
         with contextlib.suppress(BlockingIOError):
             while True:
@@ -284,13 +290,27 @@ def unwritable(request):
     os.close(writer)
 
 
-@pytest.mark.parametrize("second", ["send()", ""], ids=["second signal", "notice"])
-def test_it_leaves_in_time_where_stderr_cannot_be_written(second, unwritable):
-    code, seconds, _ = listen(
-        f"print('listening', flush=True)\nsend()\ntime.sleep(1)\n{second}\ntime.sleep({LONG})",
-        notice=300 if second else 5,
-        stderr=unwritable,
-    )
+@pytest.fixture(scope="module")
+def left():
+    """How processes left whose standard error takes nothing, all of which wait at the same time."""
+
+    def leave(second, kind):
+        send = SECOND[second]
+        program = (
+            f"print('listening', flush=True)\nsend()\ntime.sleep(1)\n{send}\ntime.sleep({LONG})"
+        )
+        with unwritable(kind) as stderr:
+            return listen(program, notice=300 if send else 5, stderr=stderr)
+
+    cases = [*itertools.product(SECOND, UNWRITABLE)]
+    with ThreadPoolExecutor(len(cases)) as pool:
+        return dict(zip(cases, pool.map(leave, *zip(*cases, strict=True)), strict=True))
+
+
+@pytest.mark.parametrize("second", SECOND)
+@pytest.mark.parametrize("kind", UNWRITABLE)
+def test_it_leaves_in_time_where_stderr_cannot_be_written(left, kind, second):
+    code, seconds, _ = left[second, kind]
     assert code == STOPPED
     assert seconds < 5.5
 

@@ -17,7 +17,7 @@ from jetbot_mjx.envs.camera.scenery import SCENERIES, draw_scenery
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation.evaluator import report_keys
+from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
 from jetbot_mjx.evaluation.robustness import MujocoEvaluator
 from jetbot_mjx.runs import Setup
 
@@ -100,7 +100,7 @@ def test_what_has_not_moved_is_not_rendered_again(env, with_opengl, monkeypatch)
     np.testing.assert_array_equal(second[[0, 2]], first[[0, 2]])
 
 
-def test_a_policy_is_evaluated_by_both_appearances(with_opengl):
+def test_a_policy_is_evaluated_by_both_appearances(with_opengl, monkeypatch):
     settings = ["camera.width=16", "camera.height=16", "task.episode_length=25"]
     settings += ["ppo.network.cnn=tiny"]
     config = load_config("configs/jetbot_camera.yaml", [*settings, "camera.frames=2"])
@@ -111,10 +111,19 @@ def test_a_policy_is_evaluated_by_both_appearances(with_opengl):
     params = PolicyParams(normalizer, policy, None)
     keys = report_keys(3)
     setup = Setup(env.config, env=env, networks=networks)
+    rollouts, run = [], Evaluator.run
+
+    def recorded(*given):
+        rollouts.append(run(*given))
+        return rollouts[-1]
+
+    monkeypatch.setattr(Evaluator, "run", recorded)
     found = MujocoEvaluator(setup, pictures=True).run(params, keys)
     assert list(found.rendered) == ["plain", "varied"]
     assert {one.episodes for one in found.rendered.values()} == {3}
     assert found.rendered["plain"].episode_return != found.rendered["varied"].episode_return
+    # What is not asked for is not rendered. The episodes were run already.
+    monkeypatch.setattr(Evaluator, "run", lambda *given: rollouts[0])
     assert MujocoEvaluator(setup).run(params, keys).rendered is None
 
 
