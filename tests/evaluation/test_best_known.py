@@ -131,6 +131,7 @@ def test_the_gap_is_that_of_the_means_over_the_goals_reached(searched):
     assert (left.bearing_low, left.bearing_high, left.reached) == (67.5, 112.5, 0)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_report_tells_it_in_all_its_forms(searched, tmp_path):
     searched()
     driven = make_episodes(GOALS, [1, 1, 0, 1, 1, 1, 1, 1], steps=STEPS + 6, **RECORDED)
@@ -167,6 +168,7 @@ def test_a_report_tells_it_in_all_its_forms(searched, tmp_path):
     assert 'data-json="best_known.by_direction.7.gap">' in page
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_report_without_it_says_why(searched, tmp_path):
     searched({"robot": {"preset": "real"}})
     driven = make_episodes(GOALS, np.ones(8), **RECORDED)
