@@ -37,6 +37,20 @@ def test_of_a_model_alone_the_parts_are_guessed_and_printed(checked):
     assert "turn       circles of 0.2" in printed
 
 
+def test_a_configuration_of_the_package_is_checked_by_its_name(checked):
+    assert "turtlebot: 1.8 kg" in checked("turtlebot")
+
+
+def test_other_endings_of_a_model_are_known_and_other_files_refused(checked, tmp_path):
+    model = (EXAMPLES / "turtlebot.xml").read_bytes()
+    (tmp_path / "mine.mjcf").write_bytes(model)
+    assert '"file": "mine.mjcf"' in checked(tmp_path / "mine.mjcf")
+    for name in ("mine.mjb", "mine.urdf"):
+        (tmp_path / name).write_bytes(b"<robot/>")
+        with pytest.raises(UserError, match=r"NAME.xml|this is URDF"):
+            checked(tmp_path / name)
+
+
 def test_measures_are_checked(checked, root):
     printed = checked(root / "jetbot_mjx" / "assets" / "robots" / "real.yaml")
     assert "real: 0.694 kg" in printed

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from helpers.broken_robots import BROKEN
-from helpers.own_robots import EXAMPLES, OWN_ROBOTS, copy_robot, load_robot
+from helpers.own_robots import EXAMPLES, OWN_ROBOTS, copy_robot, copy_tricycle, load_robot
 from jetbot_mjx.config import MjcfRobotConfig, load_config, model_files, parse_config
 from jetbot_mjx.envs import make_env
 from jetbot_mjx.envs.mjcf_wheels import guess_section
@@ -221,8 +221,11 @@ def test_an_own_function_that_does_not_fit_gets_one_line(own_drive, code, said):
         ({"drive": "wheels.py"}, "'wheels.py' is no drive: it should be differential, ackermann"),
         ({"drive": "tank"}, "'tank' is no drive"),
         ({"drive": "none.py:f", "wheels": None}, "none.py does not exist"),
-        ({"drive": "wheels.py:controls"}, "a function moves all actuators by itself"),
-        ({"wheels": None}, "another drive needs wheels"),
+        (
+            {"drive": "wheels.py:controls"},
+            "drive = 'wheels.py:controls' moves all actuators by itself: leave",
+        ),
+        ({"wheels": None}, "a differential drive has wheels on both sides"),
         ({"action_size": 3}, "action_size = 3: that of differential is 2"),
     ],
 )
@@ -304,6 +307,22 @@ def test_a_car_with_front_wheel_drive_turns_about_its_rear_axle(tmp_path):
     assert env.drive.rear == pytest.approx(0.0)
     trial = drive_trial(env.config, env.physics.mj_model, env.drive)
     assert trial.turn == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("driven", ["rear", "front"])
+def test_a_car_with_one_steered_wheel_is_a_bicycle(tmp_path, driven):
+    config = load_config(copy_tricycle(tmp_path, driven=driven))
+    env = make_env(config)
+    car, base = env.drive, 0.16
+    assert car.max_curvature == pytest.approx(np.tan(0.7) / base)
+    controls = np.asarray(car.controls(jnp.array([10.0, 2.0])))
+    assert controls[-1] == pytest.approx(np.arctan(2.0 * base))
+    front, left = np.hypot(1.0, 2.0 * base), 1.0 - 2.0 * 0.065
+    assert controls[0] == pytest.approx(10.0 * (front if driven == "front" else left))
+    trial = drive_trial(config, env.physics.mj_model, car)
+    assert trial == pytest.approx((1.0, 1.0), abs=0.05)
+    section = guess_section(config.robot.file, model_files(config.robot.sha256))
+    assert parse_config({"robot": section | {"sha256": config.robot.sha256}}).robot == config.robot
 
 
 def test_stops_of_the_steering_limit_it_too(tmp_path):
