@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt32
 
-from jetbot_mjx.config import Config, MjcfRobotConfig, Overrides, load_config
+from jetbot_mjx.config import Config, MjcfRobotConfig, Overrides, TaskConfig, load_config
 from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, numbers_of, observation_shapes, see
@@ -28,6 +28,7 @@ from jetbot_mjx.envs.physics import Physics
 from jetbot_mjx.envs.robot_trial import drive_trial
 from jetbot_mjx.envs.state import Obs, PhysicsState, State, robot_state
 from jetbot_mjx.envs.task import (
+    GOAL_HEIGHT,
     AdvancesGoal,
     Goal,
     GoalTask,
@@ -37,6 +38,7 @@ from jetbot_mjx.envs.task import (
     layout_size,
     make_task,
     min_std,
+    reach_on_floor,
 )
 from jetbot_mjx.errors import InvalidError, UserError
 from jetbot_mjx.mjx_import import Env
@@ -101,6 +103,7 @@ class JetBotEnv(Env):
             # MJX may not support a custom scene: build its model now, to fail before a run begins.
             # The model of a built-in task is built later, when a program is compiled.
             own = isinstance(self.robot, MjcfRobotConfig)
+            self._check_reach()
             if own or type(self.task).build_scene is not GoalTask.build_scene:
                 _ = self.physics.model
         except UserError:
@@ -115,6 +118,17 @@ class JetBotEnv(Env):
                 f"task.name = {config.task.name!r}: its scene cannot be simulated: {reason}"
                 f" (jetbot-mjx check-env {config.task.name} says more)"
             ) from None
+
+    def _check_reach(self) -> None:
+        """Check that the robot is not so high above its goals that it reaches none."""
+        height = float(self.mj_model.qpos0[2])
+        if reach_on_floor(self.task, height) == 0.0:
+            radius = np.hypot(height - GOAL_HEIGHT, TaskConfig().success_radius)
+            raise UserError(
+                f"task.success_radius = {self.config.task.success_radius:g} cannot be reached:"
+                f" goals are {GOAL_HEIGHT:g} m above the floor, and the body of"
+                f" {self.robot.label} is {height:.3g} m above it: set {radius:.2g}"
+            )
 
     def __repr__(self) -> str:
         """Return the task, the robot and the sizes in one line."""

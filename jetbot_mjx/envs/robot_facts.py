@@ -1,5 +1,6 @@
 """Tell what a robot is, how it follows its commands, and how fast it is simulated."""
 
+import math
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -10,6 +11,7 @@ from jetbot_mjx.config import MjcfRobotConfig
 from jetbot_mjx.envs.drive import AckermannDrive, OwnDrive
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_trial import drive_trial
+from jetbot_mjx.envs.task import reach_on_floor
 
 _STEPS = 64
 """Steps of a call whose rate is measured."""
@@ -33,9 +35,12 @@ def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
         yield "drive", f"{drive.action_size} numbers, by a function of its own"
         return
     top = config.task.max_speed
-    yield "speed", f"{trial.speed * top:.3g} m/s of task.max_speed = {top:g}"
+    speed = trial.speed * top
+    yield "speed", f"{speed:.3g} m/s of task.max_speed = {top:g}"
     if isinstance(drive, AckermannDrive):
-        yield "turn", f"circles of {1.0 / (trial.turn * drive.max_curvature):.3g} m"
+        curvature = trial.turn * drive.max_curvature
+        yield "turn", f"circles of {1.0 / curvature:.3g} m"
+        yield from _goals(env, speed, speed * curvature)
         return
     wheels = f"wheels of {1e3 * drive.wheel_radius:.3g} mm"
     yield "wheels", f"{wheels}, {1e3 * drive.wheel_separation:.3g} mm apart for the controller"
@@ -46,6 +51,28 @@ def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
             key = "wheel_separation"
         fits = drive.wheel_separation / trial.turn
         yield "", f"robot.{key} = {fits:.2g} would make that 100 %"
+    yield from _goals(env, speed, trial.turn * drive.max_yaw_rate)
+
+
+def _goals(env: JetBotEnv, speed: float, yaw_rate: float) -> Iterator[tuple[str, str]]:
+    """Yield how long the farthest goal takes, unless the task has goals of its own.
+
+    Args:
+      env: one environment, unwrapped.
+      speed: the largest speed [m/s].
+      yaw_rate: the largest yaw rate [rad/s].
+    """
+    task = env.config.task
+    reach = reach_on_floor(env.task, float(env.mj_model.qpos0[2]))
+    if reach is None:
+        return
+    farthest = task.goal_distance_min + task.goal_distance_span
+    seconds, limit = (farthest - reach) / speed + math.pi / yaw_rate, task.episode_length * env.dt
+    yield "goals", f"reached within {1e3 * reach:.3g} mm on the floor"
+    yield "", f"{farthest:g} m to the rear takes {seconds:.2g} s, an episode {limit:.2g} s"
+    if seconds > limit:
+        steps = math.ceil(1.25 * seconds / env.dt / 64) * 64
+        yield "", f"task.episode_length = {steps} would be enough"
 
 
 def step_rate(env: JetBotEnv, robots: int) -> float:

@@ -31,6 +31,18 @@ def test_a_configuration_is_checked_with_its_settings(checked):
     assert better == pytest.approx(0.2 / (turn / 100), rel=0.03)
 
 
+def test_how_long_the_farthest_goal_takes_is_told(checked):
+    printed = checked("turtlebot")
+    assert "goals      reached within 98.5 mm on the floor" in printed
+    # 1.1 m at 0.49 m/s, and half a turn at 2.5 rad/s.
+    assert "1.2 m to the rear takes 3.5 s, an episode 6.4 s" in printed
+    assert "episode_length" not in printed
+    assert "takes 2.4 s" in checked("car")
+    printed = checked("turtlebot", "--set", "task.episode_length=192")
+    assert "an episode 3.2 s" in printed
+    assert "task.episode_length = 320 would be enough" in printed
+
+
 def test_of_a_model_alone_the_parts_are_guessed_and_printed(checked):
     printed = checked(EXAMPLES / "car.xml")
     assert '"drive": "ackermann", "steering": {"left": ["steer_left"]' in printed

@@ -291,6 +291,25 @@ def test_angles_of_the_base_are_not_those_of_its_start(tmp_path):
     assert env.mj_model.qpos0[6] == 0.0
 
 
+def test_a_base_far_above_the_goals_needs_a_larger_radius(tmp_path):
+    # The frame of the base is 0.2 m above the axle, and the robot the same.
+    higher = (
+        ('pos="0 0 0.033"', 'pos="0 0 0.233"'),
+        ('pos="0 0.08 0"', 'pos="0 0.08 -0.2"'),
+        ('pos="0 -0.08 0"', 'pos="0 -0.08 -0.2"'),
+        ('pos="-0.03 0 0.02"', 'pos="-0.03 0 -0.18"'),
+        ('pos="-0.081 0 -0.023"', 'pos="-0.081 0 -0.223"'),
+    )
+    config = copy_robot(tmp_path, "turtlebot", higher)
+    said = (
+        "goals are 0.05 m above the floor, and the body of turtlebot is 0.232 m above it: set 0.21"
+    )
+    with pytest.raises(UserError, match=f"task.success_radius = 0.1 cannot be reached: {said}"):
+        make_env(config)
+    env = make_env(config, {"task.success_radius": 0.21})
+    assert env.mj_model.qpos0[2] == pytest.approx(0.233, abs=1e-3)
+
+
 def test_files_of_one_name_in_two_folders_are_two(tmp_path):
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
     for folder in ("shows", "touches"):
