@@ -25,7 +25,7 @@ from jetbot_mjx.envs.drive import Drive, jetbot_drive
 from jetbot_mjx.envs.mjcf_robot import RobotFileError
 from jetbot_mjx.envs.mjcf_wheels import find_drive
 from jetbot_mjx.envs.physics import Physics
-from jetbot_mjx.envs.robot_trial import drive_trial
+from jetbot_mjx.envs.robot_trial import Trial, drive_trial
 from jetbot_mjx.envs.state import Obs, PhysicsState, State, robot_state
 from jetbot_mjx.envs.task import (
     GOAL_HEIGHT,
@@ -95,7 +95,7 @@ class JetBotEnv(Env):
         try:
             self.mj_model: mujoco.MjModel = make_model()
             self.physics = Physics(make_model(visual=False), config.physics)
-            self.drive: Drive = _drive(config, self.physics.mj_model)
+            self.drive, self.trial = _drive(config, self.physics.mj_model)
             self.camera = None
             if config.task.sees:
                 body = robot_model.robot_body(self.mj_model)
@@ -388,13 +388,16 @@ class JetBotEnv(Env):
         return self.config.physics.ctrl_dt
 
 
-def _drive(config: Config, model: mujoco.MjModel) -> Drive:
-    """Return the drive of a configuration's robot; one that is a model of its own must drive."""
+def _drive(config: Config, model: mujoco.MjModel) -> tuple[Drive, Trial | None]:
+    """Return the drive of a configuration's robot; one that is a model of its own must drive.
+
+    Returns:
+      The drive, and how the robot follows it; None where that is not tried.
+    """
     if not isinstance(config.robot, MjcfRobotConfig):
-        return jetbot_drive(config)
+        return jetbot_drive(config), None
     drive = find_drive(config.robot, config.task, model)
-    drive_trial(config, model, drive)
-    return drive
+    return drive, drive_trial(config, model, drive)
 
 
 def _check_one(name: str, array: object, shape: tuple[int, ...], method: str) -> None:
