@@ -22,9 +22,13 @@ _WELL = 0.05
 _BADLY = 0.3
 """Share from which a training is told so."""
 
-_HORIZONS = (4, 6)
-"""Horizons of the discounting that half a turn may take, with the proposed one and at most: in a
-million steps a six-wheeled rover learned with 6.7 of them, and not with 9.4."""
+_HORIZONS = (2.3, 3.5)
+"""Horizons of the discounting that half a turn may take, with the proposed one and at most. After a
+million steps a six-wheeled rover reached 100 % of the goals with 2.3 of them, 98 % with 3.8, and
+7 % with 9.4."""
+
+_SPARE = 1.6
+"""Length of the proposed episode, in times to the farthest goal: a policy that learns is slow."""
 
 
 def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
@@ -106,7 +110,7 @@ def _goal_hints(env: JetBotEnv, trial: Trial) -> Iterator[str]:
     farthest = task.goal_distance_min + task.goal_distance_span
     seconds, limit = half + (farthest - reach) / speed, task.episode_length * env.dt
     if seconds > limit:
-        steps = math.ceil(1.25 * seconds / env.dt / 64) * 64
+        steps = math.ceil(_SPARE * seconds / env.dt / 64) * 64
         yield (
             f"a goal {farthest:g} m to the rear takes {seconds:.2g} s, and an episode ends after"
             f" {limit:.2g} s: task.episode_length = {steps} would be enough"
@@ -115,7 +119,7 @@ def _goal_hints(env: JetBotEnv, trial: Trial) -> Iterator[str]:
     if half * (1.0 - env.config.ppo.discounting) > most_horizons * env.dt:
         yield (
             f"half a turn takes {half:.2g} s, beyond the horizon of ppo.discounting ="
-            f" {env.config.ppo.discounting:g}: {1.0 - proposed * env.dt / half:.2g} would reach"
+            f" {env.config.ppo.discounting:g}: {1.0 - proposed * env.dt / half:.3g} would reach"
             " further"
         )
 

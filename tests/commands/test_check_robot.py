@@ -39,16 +39,16 @@ def test_what_keeps_a_robot_from_the_farthest_goal_is_told(checked):
     assert "hint" not in printed
     # 1.1 m at 0.49 m/s, and half a turn at 2.5 rad/s.
     printed = checked("turtlebot", "--set", "task.episode_length=192")
-    assert "rear takes 3.5 s, and an episode ends after 3.2 s: task.episode_length = 320" in printed
-    # A horizon of 100 steps of 1/60 s, of which six are enough for half a turn at 0.3 rad/s.
+    assert "rear takes 3.5 s, and an episode ends after 3.2 s: task.episode_length = 384" in printed
+    # A horizon of 100 steps of 1/60 s is a sixth of half a turn at 0.3 rad/s.
     slow = ("--set", "task.max_yaw_rate=0.3", "--set", "task.episode_length=1024")
     printed = checked("turtlebot", *slow, "--set", "ppo.discounting=0.99")
-    assert "half a turn takes 10 s, beyond the horizon of ppo.discounting = 0.99: 0.99" in printed
-    assert "hint" not in checked("turtlebot", *slow, "--set", "ppo.discounting=0.9905")
+    assert "half a turn takes 10 s, beyond the horizon of ppo.discounting = 0.99: 0.996" in printed
+    assert "hint" not in checked("turtlebot", *slow, "--set", "ppo.discounting=0.9945")
     assert "hint" not in checked("car")
     printed = checked("car", "--set", "ppo.discounting=0.7", "--set", "task.episode_length=64")
     assert "rear takes 2.4 s, and an episode ends after 2.1 s" in printed
-    assert "half a turn takes 0.99 s, beyond the horizon of ppo.discounting = 0.7: 0.87" in printed
+    assert "half a turn takes 0.99 s, beyond the horizon of ppo.discounting = 0.7: 0.92" in printed
 
 
 @pytest.mark.parametrize("name", OWN_ROBOTS)
