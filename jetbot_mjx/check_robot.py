@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from jetbot_mjx import cli, startup
 from jetbot_mjx.config import (
+    YAML_ENDINGS,
     Config,
+    is_model,
     load_config,
     model_files,
     parse_config,
@@ -64,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _config(file: Path, overrides: Sequence[str]) -> Config:
     """Return a configuration with the robot of a file."""
-    if file.suffix == ".xml":
+    if is_model({"file": str(file)}):
         from jetbot_mjx.envs import guess_section
 
         files: Mapping[str, bytes] = model_files(register(file)) or {}
@@ -76,7 +78,7 @@ def _config(file: Path, overrides: Sequence[str]) -> Config:
             )
         cli.tell(f"robot: {json.dumps(section)}")
         return load_config(parse_config({"robot": {**section, "file": str(file)}}), overrides)
-    if "robot" in read_yaml(file):
+    if not file.suffix or (file.suffix in YAML_ENDINGS and "robot" in read_yaml(file)):
         return load_config(file, overrides)
     return load_config(parse_config({"robot": {"file": str(file)}}), overrides)
 

@@ -22,6 +22,7 @@ from .robot_files import model_files as model_files
 from .robot_files import register as register
 from .robot_mjcf import MjcfRobotConfig as MjcfRobotConfig
 from .robot_mjcf import Sides as Sides
+from .robot_mjcf import is_model as is_model
 from .robot_quantities import RobotParams as RobotParams
 from .run import CHANGEABLE_ON_RESUME as CHANGEABLE_ON_RESUME
 from .run import Config as Config
@@ -32,5 +33,6 @@ from .task_modules import import_root as import_root
 from .task_modules import source_file as source_file
 from .value_types import NonNegative as NonNegative
 from .value_types import Positive as Positive
+from .yaml_text import YAML_ENDINGS as YAML_ENDINGS
 from .yaml_text import parse_yaml as parse_yaml
 from .yaml_text import read_yaml as read_yaml

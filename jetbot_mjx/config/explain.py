@@ -43,6 +43,8 @@ def explain(error: ErrorDetails) -> str:
         case "missing" if isinstance(error["input"], list | tuple):
             value = shown(list(error["input"]))
             return f"{'.'.join(location[:-1])} = {value} is wrong: it lacks items"
+        case "missing":
+            return f"{key} is missing: {'.'.join(location[:-1])} = {value}"
         case "too_short":
             return f"{key} = {value} is wrong: it should have at least 1 item"
         case "too_long":
@@ -59,6 +61,8 @@ def explain(error: ErrorDetails) -> str:
                 remedy = (
                     f"a robot with a model of its own has {', '.join(MjcfRobotConfig.model_fields)}"
                 )
+            elif location[0] == "robot" and location[1] in MjcfRobotConfig.model_fields:
+                remedy = "only a robot that is a MuJoCo model has it, of robot.file: NAME.xml"
             return f"{'.'.join(location)} = {shown(value)} is unknown: {remedy}"
         case "value_error":
             # A file that the configuration names says itself what is wrong with it.

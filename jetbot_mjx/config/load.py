@@ -12,7 +12,7 @@ from jetbot_mjx.config.robot_files import FOLDER
 from jetbot_mjx.config.robot_mjcf import MjcfRobotConfig, is_model
 from jetbot_mjx.config.run import Config, with_defaults
 from jetbot_mjx.config.task_modules import find_task_beside
-from jetbot_mjx.config.yaml_text import parse_any, read_yaml
+from jetbot_mjx.config.yaml_text import YAML_ENDINGS, parse_any, read_yaml
 from jetbot_mjx.errors import clipped, shown
 
 Overrides = Mapping[str, object] | Sequence[str]
@@ -94,6 +94,11 @@ def _with_robot_of_file(values: Mapping[str, object]) -> Mapping[str, object]:
     if is_model(robot):
         return values
     path = Path(robot["file"])
+    if path.suffix not in YAML_ENDINGS:
+        raise ConfigError(
+            f"robot.file {path}: it should be the measures of a robot, NAME.yaml, or a MuJoCo"
+            " model, NAME.xml"
+        )
     values = {**values, "robot": {**robot, "file": path.name}}
     if RobotConfig.model_fields.keys() <= robot.keys():
         return values

@@ -22,6 +22,12 @@ MAX_BYTES = 20_000_000
 _MODELS: dict[str, Mapping[str, bytes]] = {}
 """Files of each model that this process has read, by their hash."""
 
+_URDF = (
+    "this is URDF, which has no motors: make MJCF of it in Python, by spec ="
+    " mujoco.MjSpec.from_file(...), spec.worldbody.first_body().add_freejoint(),"
+    " spec.add_actuator(...) for each driven wheel, spec.compile(), and spec.to_xml()"
+)
+
 _FOLDERS = {"mesh": "meshdir", "texture": "texturedir", "hfield": "meshdir", "skin": "meshdir"}
 """Attributes of MJCF's `compiler` that name the folders of elements."""
 
@@ -77,10 +83,14 @@ def _collect(
     if len(files) == before:
         return
     try:
-        tree = ElementTree.fromstring(text)
-    # The latter two are of an encoding that this reader does not have.
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise ConfigError(f"robot.file {path}: this is not XML: {error}") from None
+        tree = ElementTree.fromstring(text.decode("utf-8-sig"))
+    except UnicodeDecodeError:
+        raise ConfigError(f"robot.file {path}: this is not UTF-8 text, as MJCF is") from None
+    except ElementTree.ParseError as error:
+        reason = f"this is not XML: {error}" if text.strip() else "it is empty"
+        raise ConfigError(f"robot.file {path}: {reason}") from None
+    if tree.tag == "robot":
+        raise ConfigError(f"robot.file {path}: {_URDF}")
     if tree.tag not in ("mujoco", "mujocoinclude"):
         raise ConfigError(
             f"robot.file {path}: <{tree.tag}> is not a MuJoCo model: its root should be <mujoco>"
@@ -120,7 +130,8 @@ def _read(path: Path, root: Path, files: dict[str, bytes]) -> bytes:
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise ConfigError(f"robot.file {path} is no regular file")
+            kind = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
+            raise ConfigError(f"robot.file {path} is {kind}")
         if status.st_size > MAX_BYTES:
             raise _too_large(path, status.st_size)
         content = path.read_bytes()

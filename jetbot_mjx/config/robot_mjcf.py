@@ -13,8 +13,10 @@ from jetbot_mjx.config.section import Section
 from jetbot_mjx.config.value_types import integral
 from jetbot_mjx.errors import shown
 
-Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1, max_length=16)]
+Names = Annotated[tuple[str, ...], Field(strict=False, max_length=16)]
 
+MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")
+"""Endings of files of a model; what holds URDF is refused with what to do."""
 
 OF_CARS = (
     *("friction", "mass", "com_x", "com_y", "com_z", "action_delay"),
@@ -30,7 +32,7 @@ def is_model(values: object) -> bool:
     if isinstance(values, MjcfRobotConfig):
         return True
     file = values.get("file") if isinstance(values, Mapping) else None
-    return isinstance(file, str) and file.endswith(".xml")
+    return isinstance(file, str) and Path(file).suffix.lower() in MODEL_ENDINGS
 
 
 def _drive(name: str) -> str:
@@ -47,12 +49,14 @@ def _drive(name: str) -> str:
 
 
 class Sides(Section):
-    """Actuators on both sides of a robot."""
+    """Actuators by the side of the robot on which they are."""
 
-    left: Names
+    left: Names = ()
     """Names of the actuators on the left side."""
-    right: Names
+    right: Names = ()
     """Names of those on the right side."""
+    middle: Names = ()
+    """Names of those in the middle, as of a car with one steered wheel."""
 
 
 class MjcfRobotConfig(Section):
@@ -69,9 +73,11 @@ class MjcfRobotConfig(Section):
     action_size: Annotated[int, BeforeValidator(integral), Field(ge=1, le=32)] = 2
     """Length of the action of a function of your own."""
     wheels: Sides | None = None
-    """Velocity actuators of the driven wheels; null where the drive is a function of your own."""
+    """Velocity actuators of the driven wheels: `left` and `right`, of a car also `middle`; null
+    where the drive is a function of your own."""
     steering: Sides | None = None
-    """Position actuators of the steered wheels, of a car."""
+    """Position actuators of the steered wheels of a car: `left` and `right`, or one in the
+    `middle`."""
     wheel_radius: Radius | None = None
     """[m] radius of the driven wheels; null: that of their geoms."""
     wheel_separation: Length | None = None
@@ -94,15 +100,25 @@ class MjcfRobotConfig(Section):
 
     @model_validator(mode="after")
     def _steers(self) -> Self:
-        if (self.drive == "ackermann") != (self.steering is not None):
+        hint = "`jetbot-mjx check-robot` prints those of a model"
+        if self.has_own_drive and (self.wheels or self.steering):
             raise ValueError(
-                f"drive = {self.drive!r} and steering = {self.steering!r} do not fit: a car has"
-                " both, another robot has no steering"
+                f"drive = {self.drive!r} moves all actuators by itself: leave robot.wheels and"
+                " robot.steering out"
             )
-        if self.has_own_drive == (self.wheels is not None):
+        wheels, steering = self.wheels or Sides(), self.steering or Sides()
+        if self.drive == "differential" and steering != Sides():
             raise ValueError(
-                f"drive = {self.drive!r} and wheels = {self.wheels!r} do not fit: a function moves"
-                " all actuators by itself, another drive needs wheels"
+                "steering is that of a car: set robot.drive: ackermann, or leave it out"
+            )
+        if self.drive == "differential" and (not wheels.left or not wheels.right or wheels.middle):
+            raise ValueError(
+                "a differential drive has wheels on both sides, and none in the middle: name the"
+                f" actuators in robot.wheels.left and robot.wheels.right; {hint}"
+            )
+        if self.drive == "ackermann" and Sides() in (wheels, steering):
+            raise ValueError(
+                f"a car has actuators in robot.wheels and in robot.steering: name them; {hint}"
             )
         if self.action_size != 2 and not self.has_own_drive:
             raise ValueError(f"action_size = {self.action_size}: that of {self.drive} is 2")

@@ -17,6 +17,9 @@ from jetbot_mjx.config.errors import ConfigError, ConfigNotFoundError
 from jetbot_mjx.config.files import run_around
 from jetbot_mjx.errors import clipped, shown
 
+YAML_ENDINGS = (".yaml", ".yml", ".json")
+"""Endings of files of settings: JSON is YAML too."""
+
 _MOST_YAML_CHARACTERS = 100_000
 _MOST_YAML_VALUES = 100_000
 """Largest size of a file of settings, as text and with all aliases replaced by what they stand for.
@@ -57,6 +60,11 @@ def read_yaml(path: Path, what: str = "config") -> dict[str, object]:
             raise ConfigError(f"{what} {path} is a folder: {remedy}") from None
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise ConfigError(f"{what} {path} cannot be read: {reason}") from None
+    if text.lstrip("\ufeff \n").startswith("<"):
+        raise ConfigError(
+            f"{what} {path} is XML, not YAML: name a robot's model in a configuration, as robot:"
+            " {file: NAME.xml, ...}; `jetbot-mjx check-robot NAME.xml` prints that section"
+        )
     return parse_yaml(text, f"{what} {path}")
 
 

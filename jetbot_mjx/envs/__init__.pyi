@@ -34,6 +34,7 @@ from .program_key import is_built_in as is_built_in
 from .program_key import open_program_cache as open_program_cache
 from .robot_facts import describe_robot as describe_robot
 from .robot_facts import step_rate as step_rate
+from .robot_facts import training_hints as training_hints
 from .robot_model import QPOS_QUAT as QPOS_QUAT
 from .robot_model import QPOS_XYZ as QPOS_XYZ
 from .robot_model import make_mj_model as make_mj_model

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt32
 
-from jetbot_mjx.config import Config, MjcfRobotConfig, Overrides, load_config
+from jetbot_mjx.config import Config, MjcfRobotConfig, Overrides, TaskConfig, load_config
 from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, numbers_of, observation_shapes, see
@@ -25,9 +25,10 @@ from jetbot_mjx.envs.drive import Drive, jetbot_drive
 from jetbot_mjx.envs.mjcf_robot import RobotFileError
 from jetbot_mjx.envs.mjcf_wheels import find_drive
 from jetbot_mjx.envs.physics import Physics
-from jetbot_mjx.envs.robot_trial import drive_trial
+from jetbot_mjx.envs.robot_trial import Trial, drive_trial
 from jetbot_mjx.envs.state import Obs, PhysicsState, State, robot_state
 from jetbot_mjx.envs.task import (
+    GOAL_HEIGHT,
     AdvancesGoal,
     Goal,
     GoalTask,
@@ -37,6 +38,7 @@ from jetbot_mjx.envs.task import (
     layout_size,
     make_task,
     min_std,
+    reach_on_floor,
 )
 from jetbot_mjx.errors import InvalidError, UserError
 from jetbot_mjx.mjx_import import Env
@@ -93,7 +95,7 @@ class JetBotEnv(Env):
         try:
             self.mj_model: mujoco.MjModel = make_model()
             self.physics = Physics(make_model(visual=False), config.physics)
-            self.drive: Drive = _drive(config, self.physics.mj_model)
+            self.drive, self.trial = _drive(config, self.physics.mj_model)
             self.camera = None
             if config.task.sees:
                 body = robot_model.robot_body(self.mj_model)
@@ -101,6 +103,7 @@ class JetBotEnv(Env):
             # MJX may not support a custom scene: build its model now, to fail before a run begins.
             # The model of a built-in task is built later, when a program is compiled.
             own = isinstance(self.robot, MjcfRobotConfig)
+            self._check_reach()
             if own or type(self.task).build_scene is not GoalTask.build_scene:
                 _ = self.physics.model
         except UserError:
@@ -115,6 +118,17 @@ class JetBotEnv(Env):
                 f"task.name = {config.task.name!r}: its scene cannot be simulated: {reason}"
                 f" (jetbot-mjx check-env {config.task.name} says more)"
             ) from None
+
+    def _check_reach(self) -> None:
+        """Check that the robot is not so high above its goals that it reaches none."""
+        height = float(self.mj_model.qpos0[2])
+        if reach_on_floor(self.task, height) == 0.0:
+            radius = np.hypot(height - GOAL_HEIGHT, TaskConfig().success_radius)
+            raise UserError(
+                f"task.success_radius = {self.config.task.success_radius:g} cannot be reached:"
+                f" goals are {GOAL_HEIGHT:g} m above the floor, and the body of"
+                f" {self.robot.label} is {height:.3g} m above it: set {radius:.2g}"
+            )
 
     def __repr__(self) -> str:
         """Return the task, the robot and the sizes in one line."""
@@ -374,13 +388,16 @@ class JetBotEnv(Env):
         return self.config.physics.ctrl_dt
 
 
-def _drive(config: Config, model: mujoco.MjModel) -> Drive:
-    """Return the drive of a configuration's robot; one that is a model of its own must drive."""
+def _drive(config: Config, model: mujoco.MjModel) -> tuple[Drive, Trial | None]:
+    """Return the drive of a configuration's robot; one that is a model of its own must drive.
+
+    Returns:
+      The drive, and how the robot follows it; None where that is not tried.
+    """
     if not isinstance(config.robot, MjcfRobotConfig):
-        return jetbot_drive(config)
+        return jetbot_drive(config), None
     drive = find_drive(config.robot, config.task, model)
-    drive_trial(config, model, drive)
-    return drive
+    return drive, drive_trial(config, model, drive)
 
 
 def _check_one(name: str, array: object, shape: tuple[int, ...], method: str) -> None:

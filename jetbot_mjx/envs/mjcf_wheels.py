@@ -26,8 +26,15 @@ from jetbot_mjx.envs.mjcf_robot import PREFIX, RobotFileError, parse_model
 
 _LARGEST_RADIUS = 0.5  # [m]
 _PARALLEL = 0.95  # smallest cosine between directions that should be parallel
+_SIDES = ("left", "right", "middle")
+_NEAR = 1e-3  # [m] largest distance of what is in the middle, or on one axle
 _ROLLING = {mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID}
 _LONG = {mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE}
+
+
+def _side(y: float) -> str:
+    """Return the side of a robot on which a wheel is, by its position to the left [m]."""
+    return "middle" if abs(y) <= _NEAR else "left" if y > 0 else "right"
 
 
 def find_drive(robot: MjcfRobotConfig, task: TaskConfig, model: mujoco.MjModel) -> Drive:
@@ -118,30 +125,24 @@ class _Parts:
         return RobotFileError(self._robot, f"robot.{key}: {reason}")
 
     def wheels(self, sides: Sides, key: str) -> tuple[Wheel, ...]:
-        """Return the wheels of both sides."""
-        found = {
-            side: [self._wheel(name, f"{key}.{side}") for name in getattr(sides, side)]
-            for side in ("left", "right")
-        }
-        if shared := {*sides.left} & {*sides.right}:
-            raise self._error(key, f"{', '.join(sorted(shared))} is on both sides")
-        for side, names in (("left", sides.left), ("right", sides.right)):
-            if twice := {name for name in names if names.count(name) > 1}:
-                raise self._error(f"{key}.{side}", f"{', '.join(sorted(twice))} is named twice")
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            for name, wheel in zip(getattr(sides, side), found[side], strict=True):
-                if sign * wheel.y <= 0:
-                    raise self._error(
-                        f"{key}.{side}",
-                        f"{name} is {abs(wheel.y):.3g} m to the"
-                        f" {'right' if side == 'left' else 'left'} of the base: swap the sides, or"
-                        " turn the base so that x is forward",
-                    )
-        both = (*found["left"], *found["right"])
-        radii = [one.radius for one in both]
+        """Return the wheels of all sides."""
+        named = [(name, side) for side in _SIDES for name in getattr(sides, side)]
+        found = tuple(self._wheel(name, f"{key}.{side}") for name, side in named)
+        names = [name for name, _ in named]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise self._error(key, f"{', '.join(sorted(twice))} is named twice")
+        for (name, side), wheel in zip(named, found, strict=True):
+            if (there := _side(wheel.y)) != side:
+                apart = f"{abs(wheel.y):.3g} m to the {there}"
+                raise self._error(
+                    f"{key}.{side}",
+                    f"{name} is {'in the middle' if there == 'middle' else apart} of the base: name"
+                    f" it under {there}, or turn the base so that x is forward",
+                )
+        radii = [one.radius for one in found]
         if max(radii) - min(radii) > 0.01 * max(radii):
             raise self._error(key, f"wheels of {min(radii):g} and {max(radii):g} m: give them one")
-        return both
+        return found
 
     def check_actuators(self, wheels: Sequence[Wheel]) -> None:
         """Check that every actuator is of one wheel."""
@@ -187,7 +188,14 @@ class _Parts:
         ]
         of_motors = [one for one in hinges if one in {self._joints.of(x.actuator) for x in driven}]
         still = [self._joints.place(joint)[0] for joint in of_motors or hinges]
-        return float(np.mean(still or [min(one.x for one in steered)]))
+        rear = float(np.mean(still or [min(one.x for one in steered)]))
+        if max(abs(one.x - rear) for one in steered) < _NEAR:
+            raise self._error(
+                "steering",
+                "no wheel that stays straight is behind the steered ones or before them: a car"
+                " turns about the axle of such wheels, whose hinges are parallel to y",
+            )
+        return rear
 
     def _is_on(self, joint: int, bodies: Collection[int]) -> bool:
         """Return whether a joint's body is one of some bodies, or on one."""
@@ -297,11 +305,9 @@ def guess_section(file: str, files: Mapping[str, bytes]) -> dict[str, object]:
             continue
         joint = joints.of(index)
         kind = "steering" if abs(joints.axis(joint)[2]) > _PARALLEL else "wheels"
-        side = "left" if joints.place(joint)[1] > 0 else "right"
+        side = _side(joints.place(joint)[1])
         parts[kind].setdefault(side, []).append(model.actuator(index).name)
-    if set(parts["wheels"]) != {"left", "right"}:
-        return {}
-    section: dict[str, object] = {"file": file, "wheels": parts["wheels"]}
-    if set(parts["steering"]) == {"left", "right"}:
-        section |= {"drive": "ackermann", "steering": parts["steering"]}
-    return section
+    wheels, steering = parts["wheels"], parts["steering"]
+    if wheels and steering:
+        return {"file": file, "wheels": wheels, "drive": "ackermann", "steering": steering}
+    return {"file": file, "wheels": wheels} if set(wheels) == {"left", "right"} else {}

@@ -1,5 +1,6 @@
 """Tell what a robot is, how it follows its commands, and how fast it is simulated."""
 
+import math
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -9,13 +10,25 @@ import jax
 from jetbot_mjx.config import MjcfRobotConfig
 from jetbot_mjx.envs.drive import AckermannDrive, OwnDrive
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_trial import drive_trial
+from jetbot_mjx.envs.robot_trial import Trial, drive_trial
+from jetbot_mjx.envs.task import reach_on_floor
 
 _STEPS = 64
 """Steps of a call whose rate is measured."""
 
 _WELL = 0.05
 """Largest share by which a robot may turn less or more than it is told, without a hint."""
+
+_BADLY = 0.3
+"""Share from which a training is told so."""
+
+_HORIZONS = (2.3, 3.5)
+"""Horizons of the discounting that half a turn may take, with the proposed one and at most. After a
+million steps a six-wheeled rover reached 100 % of the goals with 2.3 of them, 98 % with 3.8, and
+7 % with 9.4."""
+
+_SPARE = 1.6
+"""Length of the proposed episode, in times to the farthest goal: a policy that learns is slow."""
 
 
 def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
@@ -24,28 +37,91 @@ def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
     Args:
       env: one environment, unwrapped.
     """
-    config, drive, model = env.config, env.drive, env.physics.mj_model
+    drive, model = env.drive, env.physics.mj_model
     mass = float(model.body_subtreemass[model.jnt_bodyid[0]])
     height = float(model.qpos0[2])
     yield "robot", f"{env.robot.label}: {mass:.3g} kg, its body {1e3 * height:.3g} mm up at rest"
-    trial = drive_trial(config, model, drive)
+    trial = env.trial or drive_trial(env.config, model, drive)
     if trial is None or isinstance(drive, OwnDrive):
         yield "drive", f"{drive.action_size} numbers, by a function of its own"
         return
-    top = config.task.max_speed
+    top = env.config.task.max_speed
     yield "speed", f"{trial.speed * top:.3g} m/s of task.max_speed = {top:g}"
     if isinstance(drive, AckermannDrive):
         yield "turn", f"circles of {1.0 / (trial.turn * drive.max_curvature):.3g} m"
+    else:
+        wheels = f"wheels of {1e3 * drive.wheel_radius:.3g} mm"
+        yield "wheels", f"{wheels}, {1e3 * drive.wheel_separation:.3g} mm apart for the controller"
+        yield "turn", f"{trial.turn:.0%} of the yaw rate that is commanded"
+    if (reach := reach_on_floor(env.task, height)) is not None:
+        yield "goals", f"reached within {1e3 * reach:.3g} mm on the floor"
+    for hint in (*_turn_hint(env, trial, _WELL), *_goal_hints(env, trial)):
+        yield "hint", hint
+
+
+def training_hints(env: JetBotEnv) -> list[str]:
+    """Return the settings without which a robot that is a model of its own may not learn.
+
+    Args:
+      env: one environment, unwrapped.
+    """
+    if env.trial is None:
+        return []
+    return [*_turn_hint(env, env.trial, _BADLY), *_goal_hints(env, env.trial)]
+
+
+def _turn_hint(env: JetBotEnv, trial: Trial, least: float) -> Iterator[str]:
+    """Yield which separation of wheels would make a robot turn as it is told.
+
+    Args:
+      env: one environment, unwrapped.
+      trial: how the robot follows its commands.
+      least: the share by which it may turn less or more without a hint.
+    """
+    drive = env.drive
+    if isinstance(drive, AckermannDrive | OwnDrive) or trial.turn <= _WELL:
         return
-    wheels = f"wheels of {1e3 * drive.wheel_radius:.3g} mm"
-    yield "wheels", f"{wheels}, {1e3 * drive.wheel_separation:.3g} mm apart for the controller"
-    yield "turn", f"{trial.turn:.0%} of the yaw rate that is commanded"
-    if trial.turn > _WELL and abs(trial.turn - 1.0) > _WELL:
-        key = "controller_wheel_separation"
-        if isinstance(env.robot, MjcfRobotConfig):
-            key = "wheel_separation"
-        fits = drive.wheel_separation / trial.turn
-        yield "", f"robot.{key} = {fits:.2g} would make that 100 %"
+    if abs(trial.turn - 1.0) <= least:
+        return
+    own = isinstance(env.robot, MjcfRobotConfig)
+    key = "wheel_separation" if own else "controller_wheel_separation"
+    fits = drive.wheel_separation / trial.turn
+    yield (
+        f"the robot turns with {trial.turn:.0%} of the yaw rate that is commanded:"
+        f" robot.{key} = {fits:.2g} would make that 100 %"
+    )
+
+
+def _goal_hints(env: JetBotEnv, trial: Trial) -> Iterator[str]:
+    """Yield what keeps a robot from the farthest goal, unless the task has goals of its own.
+
+    Args:
+      env: one environment, unwrapped.
+      trial: how the robot follows its commands.
+    """
+    task, drive = env.config.task, env.drive
+    reach = reach_on_floor(env.task, float(env.mj_model.qpos0[2]))
+    if reach is None or isinstance(drive, OwnDrive):
+        return
+    speed = trial.speed * task.max_speed
+    of_car = isinstance(drive, AckermannDrive)
+    most = speed * drive.max_curvature if of_car else drive.max_yaw_rate
+    half = math.pi / (trial.turn * most)
+    farthest = task.goal_distance_min + task.goal_distance_span
+    seconds, limit = half + (farthest - reach) / speed, task.episode_length * env.dt
+    if seconds > limit:
+        steps = math.ceil(_SPARE * seconds / env.dt / 64) * 64
+        yield (
+            f"a goal {farthest:g} m to the rear takes {seconds:.2g} s, and an episode ends after"
+            f" {limit:.2g} s: task.episode_length = {steps} would be enough"
+        )
+    proposed, most_horizons = _HORIZONS
+    if half * (1.0 - env.config.ppo.discounting) > most_horizons * env.dt:
+        yield (
+            f"half a turn takes {half:.2g} s, beyond the horizon of ppo.discounting ="
+            f" {env.config.ppo.discounting:g}: {1.0 - proposed * env.dt / half:.3g} would reach"
+            " further"
+        )
 
 
 def step_rate(env: JetBotEnv, robots: int) -> float:

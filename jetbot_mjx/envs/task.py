@@ -329,6 +329,25 @@ class GoalTask:
         return jnp.linalg.norm(self.goal_position(goal) - robot.position_w)
 
 
+def reach_on_floor(task: Task, height: float) -> float | None:
+    """Return the distance on the floor within which a robot has reached its goal [m].
+
+    Args:
+      task: the task.
+      height: height of the robot's body above the floor [m].
+
+    Returns:
+      The distance; 0 where the robot reaches no goal; None for a task with goals of its own.
+    """
+    own = ("sample", "distance", "success")
+    if not isinstance(task, GoalTask) or any(
+        getattr(type(task), name) is not getattr(GoalTask, name) for name in own
+    ):
+        return None
+    radius, apart = task.config.success_radius, GOAL_HEIGHT - height
+    return math.sqrt(max(radius**2 - apart**2, 0.0))
+
+
 def make_task(config: TaskConfig, task_class: TaskClass | None = None) -> Task:
     """Import and build the task that a configuration names.
 

@@ -464,11 +464,13 @@ def _headline(training: Training) -> str:
     hosts = f" of {jax.process_count()} processes" if jax.process_count() > 1 else ""
     seeds = f", {config.seeds} seeds at once" if config.seeds > 1 else ""
     robot, *measures = config.robot.label.partition(" with ")
+    hints = "".join(f"\nhint: {one}" for one in envs.training_hints(training.setup.env))
     return (
         f"training {config.task.name} ({robot} robot{''.join(measures)},"
         f" {config.task.observation} observation) with the {config.trainer} trainer:"
         f" {config.ppo.num_timesteps:,} steps in {config.ppo.num_envs:,} environments{seeds} on"
         f" {jax.device_count()} x {device.device_kind}{hosts}\nrun folder: {training.run_dir}"
+        f"{hints}"
     )
 
 

@@ -4,8 +4,9 @@ import re
 
 import pytest
 
-from helpers.own_robots import EXAMPLES, copy_robot
+from helpers.own_robots import EXAMPLES, OWN_ROBOTS, copy_robot, load_robot
 from jetbot_mjx import check_robot
+from jetbot_mjx.envs import make_env, training_hints
 from jetbot_mjx.errors import UserError
 
 
@@ -26,15 +27,60 @@ def test_a_configuration_is_checked_with_its_settings(checked):
     assert "rover: 3.2 kg" in printed
     assert "0.79 m/s of task.max_speed = 0.8" in printed
     assert "wheels of 50 mm, 200 mm apart for the controller" in printed
+    assert "hint       the robot turns with" in printed
     turn = int(re.search(r"turn +(\d+)%", printed)[1])
     better = float(re.search(r"robot.wheel_separation = (\S+) would make that 100 %", printed)[1])
     assert better == pytest.approx(0.2 / (turn / 100), rel=0.03)
+
+
+def test_what_keeps_a_robot_from_the_farthest_goal_is_told(checked):
+    printed = checked("turtlebot")
+    assert "goals      reached within 98.5 mm on the floor" in printed
+    assert "hint" not in printed
+    # 1.1 m at 0.49 m/s, and half a turn at 2.5 rad/s.
+    printed = checked("turtlebot", "--set", "task.episode_length=192")
+    assert "rear takes 3.5 s, and an episode ends after 3.2 s: task.episode_length = 384" in printed
+    # A horizon of 100 steps of 1/60 s is a sixth of half a turn at 0.3 rad/s.
+    slow = ("--set", "task.max_yaw_rate=0.3", "--set", "task.episode_length=1024")
+    printed = checked("turtlebot", *slow, "--set", "ppo.discounting=0.99")
+    assert "half a turn takes 10 s, beyond the horizon of ppo.discounting = 0.99: 0.996" in printed
+    assert "hint" not in checked("turtlebot", *slow, "--set", "ppo.discounting=0.9945")
+    assert "hint" not in checked("car")
+    printed = checked("car", "--set", "ppo.discounting=0.7", "--set", "task.episode_length=64")
+    assert "rear takes 2.4 s, and an episode ends after 2.1 s" in printed
+    assert "half a turn takes 0.99 s, beyond the horizon of ppo.discounting = 0.7: 0.92" in printed
+
+
+@pytest.mark.parametrize("name", OWN_ROBOTS)
+def test_before_a_training_the_examples_are_told_nothing(name):
+    assert training_hints(make_env(load_robot(name))) == []
+
+
+def test_before_a_training_a_rover_that_skids_is_told_that_it_does():
+    turn, goals = training_hints(make_env(load_robot("rover", "robot.wheel_separation=0.2")))
+    assert turn.startswith("the robot turns with ")
+    assert "robot.wheel_separation = 0.54 would make that 100 %" in turn
+    assert "half a turn takes" in goals
 
 
 def test_of_a_model_alone_the_parts_are_guessed_and_printed(checked):
     printed = checked(EXAMPLES / "car.xml")
     assert '"drive": "ackermann", "steering": {"left": ["steer_left"]' in printed
     assert "turn       circles of 0.2" in printed
+
+
+def test_a_configuration_of_the_package_is_checked_by_its_name(checked):
+    assert "turtlebot: 1.8 kg" in checked("turtlebot")
+
+
+def test_other_endings_of_a_model_are_known_and_other_files_refused(checked, tmp_path):
+    model = (EXAMPLES / "turtlebot.xml").read_bytes()
+    (tmp_path / "mine.mjcf").write_bytes(model)
+    assert '"file": "mine.mjcf"' in checked(tmp_path / "mine.mjcf")
+    for name in ("mine.mjb", "mine.urdf"):
+        (tmp_path / name).write_bytes(b"<robot/>")
+        with pytest.raises(UserError, match=r"NAME.xml|this is URDF"):
+            checked(tmp_path / name)
 
 
 def test_measures_are_checked(checked, root):

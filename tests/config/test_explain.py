@@ -166,6 +166,16 @@ BAD_VALUES = {
         "learning_rate = 0.5 lies outside the schedule's [1e-05, 0.01]",
         "choose it inside, or widen the bounds",
     ),
+    "part of a caster": (
+        "robot: {casters: [{x: -0.08, radius: 0.01}]}",
+        "robot.casters.0.y is missing",
+        "robot.casters.0 = {",
+    ),
+    "wheels of measures": (
+        "robot: {wheels: {left: [l]}}",
+        "robot.wheels.left = ['l'] is unknown",
+        "only a robot that is a MuJoCo model has it, of robot.file: NAME.xml",
+    ),
     "schedule upside down": (
         "ppo: {learning_rate_schedule: ADAPTIVE_KL, learning_rate_schedule_min_lr: 0.02}",
         "[0.02, 0.01]",

@@ -155,3 +155,10 @@ def test_a_file_that_is_none_of_a_robot_is_refused_in_one_line(mine, text, said)
         load_config(mine)
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("file", ["robot.mjb", "robot.usd", "robot", "robot.sdf"])
+def test_other_files_than_measures_and_models_are_refused(tmp_path, file):
+    (tmp_path / file).write_bytes(b"\xff\0")
+    with pytest.raises(ConfigError, match=r"NAME.yaml, or a MuJoCo model, NAME.xml"):
+        parse_config({"robot": {"file": str(tmp_path / file)}})

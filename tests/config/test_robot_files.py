@@ -45,15 +45,16 @@ def test_the_hash_is_of_all_of_them(model):
     [
         ('<mujoco><include file="../other.xml"/></mujoco>', "outside of the model's folder"),
         ('<mujoco><include file="none.xml"/></mujoco>', "none.xml does not exist"),
-        ("<robot/>", "<robot> is not a MuJoCo model: its root should be <mujoco>"),
+        ("<sdf/>", "<sdf> is not a MuJoCo model: its root should be <mujoco>"),
+        ('<robot name="r"/>', "this is URDF, which has no motors: make MJCF of it in Python"),
         ("<mujoco>", "this is not XML: no element found"),
-        ('<?xml version="1.0" encoding="none"?><mujoco/>', "not XML: unknown encoding: none"),
-        ('<?xml version="1.0" encoding="shift_jis"?><mujoco/>', "not XML: multi-byte encodings"),
+        (" \n", "it is empty"),
+        (b"\xff\xfe<\0", "this is not UTF-8 text, as MJCF is"),
     ],
 )
 def test_what_is_no_model_is_refused_in_one_line(model, text, said):
     (model.parent.parent / "other.xml").write_text("<mujoco/>")
-    model.write_text(text)
+    model.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ConfigError) as error:
         register(model)
     assert said in str(error.value)
@@ -87,6 +88,8 @@ def test_folders_count_in_all_files_and_may_be_stripped_and_a_cube_has_six_sides
 
 
 def test_what_is_no_file_is_not_waited_for(model):
+    with pytest.raises(ConfigError, match="is a folder"):
+        register(model.parent)
     model.unlink()
     os.mkfifo(model)
     with pytest.raises(ConfigError, match="is no regular file"):

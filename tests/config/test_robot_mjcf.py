@@ -29,8 +29,8 @@ def test_settings_of_it_can_be_changed_and_it_can_be_replaced():
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"wheels": {"left": [], "right": ["fr"]}}, "robot.wheels.left = [] is wrong: it should"),
-        ({"wheels": None}, "wheels = None do not fit: a function moves"),
+        ({"wheels": {"left": [], "right": ["fr"]}}, "name the actuators in robot.wheels.left and"),
+        ({"wheels": None}, "a differential drive has wheels on both sides"),
         (
             {"drive": "tank"},
             "robot.drive: 'tank' is no drive: it should be differential, ackermann, or",
@@ -40,7 +40,16 @@ def test_settings_of_it_can_be_changed_and_it_can_be_replaced():
             {"chassis_mass": 2.0},
             "robot.chassis_mass = 2.0 is unknown: a robot with a model of its own has file, base",
         ),
-        ({"steering": ROVER["wheels"]}, "do not fit: a car has both"),
+        ({"wheels": {"left": ["fl"]}}, "a differential drive has wheels on both sides"),
+        ({"wheels": {**ROVER["wheels"], "middle": ["x"]}}, "and none in the middle"),
+        (
+            {"steering": ROVER["wheels"]},
+            "robot: steering is that of a car: set robot.drive: ackermann, or leave",
+        ),
+        (
+            {"drive": "ackermann", "steering": {}},
+            "a car has actuators in robot.wheels and in robot.steering",
+        ),
         ({"file": "none.xml"}, "robot.file none.xml does not exist"),
     ],
 )

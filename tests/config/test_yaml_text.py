@@ -20,6 +20,7 @@ BAD_YAML = {
     "list": ("- 1\n- 2", r"holds \[1, 2\]: write `key: value` lines"),
     "text": ("seed 3", "holds 'seed 3': write `key: value` lines"),
     "number": ("3", "holds 3: write `key: value` lines"),
+    "a model": ("\n<mujoco/>", r"mine.yaml is XML, not YAML: name a robot's model in a conf"),
 }
 
 

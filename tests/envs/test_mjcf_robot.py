@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from helpers.broken_robots import BROKEN
-from helpers.own_robots import EXAMPLES, OWN_ROBOTS, copy_robot, load_robot
+from helpers.own_robots import EXAMPLES, OWN_ROBOTS, copy_robot, copy_tricycle, load_robot
 from jetbot_mjx.config import MjcfRobotConfig, load_config, model_files, parse_config
 from jetbot_mjx.envs import make_env
 from jetbot_mjx.envs.mjcf_wheels import guess_section
@@ -221,8 +221,11 @@ def test_an_own_function_that_does_not_fit_gets_one_line(own_drive, code, said):
         ({"drive": "wheels.py"}, "'wheels.py' is no drive: it should be differential, ackermann"),
         ({"drive": "tank"}, "'tank' is no drive"),
         ({"drive": "none.py:f", "wheels": None}, "none.py does not exist"),
-        ({"drive": "wheels.py:controls"}, "a function moves all actuators by itself"),
-        ({"wheels": None}, "another drive needs wheels"),
+        (
+            {"drive": "wheels.py:controls"},
+            "drive = 'wheels.py:controls' moves all actuators by itself: leave",
+        ),
+        ({"wheels": None}, "a differential drive has wheels on both sides"),
         ({"action_size": 3}, "action_size = 3: that of differential is 2"),
     ],
 )
@@ -288,6 +291,25 @@ def test_angles_of_the_base_are_not_those_of_its_start(tmp_path):
     assert env.mj_model.qpos0[6] == 0.0
 
 
+def test_a_base_far_above_the_goals_needs_a_larger_radius(tmp_path):
+    # The frame of the base is 0.2 m above the axle, and the robot the same.
+    higher = (
+        ('pos="0 0 0.033"', 'pos="0 0 0.233"'),
+        ('pos="0 0.08 0"', 'pos="0 0.08 -0.2"'),
+        ('pos="0 -0.08 0"', 'pos="0 -0.08 -0.2"'),
+        ('pos="-0.03 0 0.02"', 'pos="-0.03 0 -0.18"'),
+        ('pos="-0.081 0 -0.023"', 'pos="-0.081 0 -0.223"'),
+    )
+    config = copy_robot(tmp_path, "turtlebot", higher)
+    said = (
+        "goals are 0.05 m above the floor, and the body of turtlebot is 0.232 m above it: set 0.21"
+    )
+    with pytest.raises(UserError, match=f"task.success_radius = 0.1 cannot be reached: {said}"):
+        make_env(config)
+    env = make_env(config, {"task.success_radius": 0.21})
+    assert env.mj_model.qpos0[2] == pytest.approx(0.233, abs=1e-3)
+
+
 def test_files_of_one_name_in_two_folders_are_two(tmp_path):
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
     for folder in ("shows", "touches"):
@@ -304,6 +326,22 @@ def test_a_car_with_front_wheel_drive_turns_about_its_rear_axle(tmp_path):
     assert env.drive.rear == pytest.approx(0.0)
     trial = drive_trial(env.config, env.physics.mj_model, env.drive)
     assert trial.turn == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("driven", ["rear", "front"])
+def test_a_car_with_one_steered_wheel_is_a_bicycle(tmp_path, driven):
+    config = load_config(copy_tricycle(tmp_path, driven=driven))
+    env = make_env(config)
+    car, base = env.drive, 0.16
+    assert car.max_curvature == pytest.approx(np.tan(0.7) / base)
+    controls = np.asarray(car.controls(jnp.array([10.0, 2.0])))
+    assert controls[-1] == pytest.approx(np.arctan(2.0 * base))
+    front, left = np.hypot(1.0, 2.0 * base), 1.0 - 2.0 * 0.065
+    assert controls[0] == pytest.approx(10.0 * (front if driven == "front" else left))
+    trial = drive_trial(config, env.physics.mj_model, car)
+    assert trial == pytest.approx((1.0, 1.0), abs=0.05)
+    section = guess_section(config.robot.file, model_files(config.robot.sha256))
+    assert parse_config({"robot": section | {"sha256": config.robot.sha256}}).robot == config.robot
 
 
 def test_stops_of_the_steering_limit_it_too(tmp_path):

@@ -1,5 +1,6 @@
 """Robots with changed parameters against C MuJoCo, closed-form solutions, and the preset."""
 
+import copy
 import functools
 import math
 
@@ -9,13 +10,15 @@ import mujoco
 import numpy as np
 import pytest
 
+from helpers.own_robots import load_robot
 from jetbot_mjx.config import RobotParams, parse_config
 from jetbot_mjx.devices import compiler_options
 from jetbot_mjx.envs import kinematics, mjx
 from jetbot_mjx.envs.domain_randomization import LARGEST_TRACED, DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import make_mj_model
-from jetbot_mjx.envs.robot_params import vary_model
+from jetbot_mjx.envs.robot_params import vary_model, vary_own_model
+from jetbot_mjx.envs.robot_trial import drive_trial
 
 ROBOTS = 16
 STEPS = 256
@@ -233,3 +236,23 @@ def test_one_program_serves_all_values(driver):
     before = drive._cache_size()
     drive(many(friction=0.5, mass=1.1, action_delay=3), straight(STEPS, 0.5))
     assert drive._cache_size() == before
+
+
+@pytest.mark.parametrize(
+    ("name", "tolerance"), [("turtlebot", 3e-3), ("car", 3e-3), ("rover", 0.1)]
+)
+def test_the_softness_of_contacts_of_an_own_robot_may_stay_where_its_mass_differs(name, tolerance):
+    env = make_env(load_robot(name))
+    varied = RobotParams()._replace(mass=1.25, com_x=-0.015)
+    ours = vary_own_model(env.physics.model, varied)
+    kept = copy.copy(env.physics.mj_model)
+    for array in ("body_mass", "body_inertia", "body_ipos", "body_invweight0"):
+        getattr(kept, array)[:] = getattr(ours, array)
+    right = copy.copy(kept)
+    mujoco.mj_setConst(right, mujoco.MjData(right))
+    base = env.physics.mj_model.jnt_bodyid[0]
+    assert kept.body_mass[base] == pytest.approx(1.25 * env.physics.mj_model.body_mass[base])
+    assert right.body_invweight0[base, 0] < 0.9 * kept.body_invweight0[base, 0]
+    one, other = (drive_trial(env.config, model, env.drive) for model in (kept, right))
+    assert one.speed == pytest.approx(other.speed, rel=3e-3)
+    assert one.turn == pytest.approx(other.turn, rel=tolerance)

@@ -18,6 +18,7 @@ from jetbot_mjx.envs.task import (
     layout_size,
     layout_table,
     make_task,
+    reach_on_floor,
 )
 
 
@@ -32,6 +33,23 @@ def robot_at(x=0.0, y=0.0, z=0.0325, yaw=0.0, velocity=(0.0, 0.0, 0.0), spin=0.0
 
 def goal_at(x, y):
     return jnp.array([x, y, 0.05], jnp.float32)
+
+
+@pytest.mark.parametrize(("height", "reach"), [(0.05, 0.1), (0.11, 0.08), (0.15, 0.0), (0.5, 0.0)])
+def test_a_goal_is_reached_within_a_distance_on_the_floor(height, reach):
+    task = GoalTask(TaskConfig())
+    assert reach_on_floor(task, height) == pytest.approx(reach, abs=1e-6)
+    for factor, reached in ((0.99, reach > 0), (1.01, False)):
+        robot = robot_at(x=factor * reach, z=height)
+        assert bool(task.success(robot, goal_at(0.0, 0.0))) == reached
+
+
+def test_the_reach_of_a_task_with_goals_of_its_own_is_not_known():
+    class High(GoalTask):
+        def sample(self, key):
+            return super().sample(key).at[2].add(1.0)
+
+    assert reach_on_floor(High(TaskConfig()), 0.03) is None
 
 
 @pytest.fixture(scope="module")

@@ -46,13 +46,13 @@ BROKEN = {
     "swapped sides": Broken(
         "turtlebot",
         (),
-        "robot.wheels.left: right is 0.08 m to the right of the base: swap the sides",
+        "robot.wheels.left: right is 0.08 m to the right of the base: name it under right, or",
         {"wheels": {"left": ["right"], "right": ["left"]}},
     ),
     "one wheel on both sides": Broken(
         "turtlebot",
         (),
-        "robot.wheels: left is on both sides",
+        "robot.wheels: left is named twice",
         {"wheels": {"left": ["left"], "right": ["left", "right"]}},
     ),
     "a wrong axis": Broken(
@@ -112,7 +112,7 @@ BROKEN = {
     "one wheel twice": Broken(
         "turtlebot",
         (),
-        "robot.wheels.left: left is named twice",
+        "robot.wheels: left is named twice",
         {"wheels": {"left": ["left", "left"], "right": ["right"]}},
     ),
     "wheels that cannot turn apart": Broken(
@@ -180,13 +180,27 @@ BROKEN = {
     "steering in degrees": Broken(
         "car", (('ctrlrange="-0.7 0.7"', 'ctrlrange="-40 40"'),), "a ctrlrange is in radians"
     ),
+    "a steered wheel in the middle": Broken(
+        "car",
+        (('name="left_knuckle" pos="0.16 0.06 0"', 'name="left_knuckle" pos="0.16 0 0"'),),
+        "robot.steering.left: steer_left is in the middle of the base: name it under middle, or",
+    ),
+    "a car without a straight axle": Broken(
+        "car",
+        (
+            ('joint name="rear_left" class="axle"', 'joint name="rear_left" axis="1 0 0"'),
+            ('joint name="rear_right" class="axle"', 'joint name="rear_right" axis="1 0 0"'),
+            ('joint="rear_', 'joint="front_'),
+        ),
+        "robot.steering: no wheel that stays straight is behind the steered ones or before them",
+    ),
     "a car without steering": Broken(
-        "car", (), "drive = 'ackermann' and steering = None do not fit", {"steering": None}
+        "car", (), "a car has actuators in robot.wheels and in robot.steering", {"steering": None}
     ),
     "no MuJoCo model": Broken(
         "turtlebot",
-        (("<mujoco", "<robot"), ("</mujoco", "</robot")),
-        "<robot> is not a MuJoCo model",
+        (("<mujoco", "<sdf"), ("</mujoco", "</sdf")),
+        "<sdf> is not a MuJoCo model",
     ),
     "no XML": Broken("turtlebot", (("</body>", ""),), "this is not XML: mismatched tag"),
     "what MuJoCo refuses": Broken(

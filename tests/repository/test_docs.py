@@ -591,6 +591,39 @@ def test_blocks_that_are_said_to_run_do(page, reader, monkeypatch, capsys):
     assert capsys.readouterr().out
 
 
+URDF = """<robot name="bot">
+<link name="base"/>
+<joint name="up" type="fixed"><parent link="base"/><child link="box"/>
+<origin xyz="0 0 0.03"/></joint>
+<link name="box"><inertial><origin xyz="-0.02 0 0.01"/><mass value="1.2"/><inertia ixx="0.004"
+iyy="0.004" izz="0.006" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="-0.06 0 -0.02"/><geometry><sphere radius="0.01"/></geometry></collision>
+</link>WHEELS</robot>"""
+WHEEL = """<link name="{0}"><inertial><mass value="0.05"/><inertia ixx="2e-5" iyy="3e-5" izz="2e-5"
+ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><geometry><sphere radius="0.03"/></geometry></collision></link>
+<joint name="{0}_wheel_joint" type="continuous"><parent link="box"/><child link="{0}"/>
+<origin xyz="0 {1} 0"/><axis xyz="0 1 0"/></joint>"""
+
+
+def test_a_robot_in_urdf_becomes_a_model_as_the_page_says(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    wheels = WHEEL.format("left", 0.08) + WHEEL.format("right", -0.08)
+    Path("my_robot.urdf").write_text(URDF.replace("WHEELS", wheels))
+    (block,) = (one for one in blocks(PAGES["own-robot.md"], "python") if "my_robot.urdf" in one)
+    exec(block, {})
+    named = {"left": ["left"], "right": ["right"]}
+    env = make_env(parse_config({"robot": {"file": "my_robot.xml", "wheels": named}}))
+    # The base has kept its mass.
+    assert env.mj_model.body_subtreemass[env.mj_model.jnt_bodyid[0]] == pytest.approx(1.3)
+    # What the message about URDF tells is what the page does.
+    with pytest.raises(ConfigError, match="this is URDF") as refused:
+        parse_config({"robot": {"file": "my_robot.urdf", "wheels": named}})
+    told = re.findall(r"spec\.[\w.()]+\w", str(refused.value))
+    assert len(told) == 4
+    assert [one for one in told if one not in block] == []
+
+
 def test_the_kernels_page_shows_what_its_first_block_prints(capsys):
     page = PAGES["kernels.md"]
     exec(compile(next(blocks(page, "python")), "kernels.md", "exec"), {})
