@@ -17,6 +17,7 @@ from jetbot_mjx.devices import default_device_cpu
 from mujoco import mjx
 from mujoco.mjx import ConeType as ConeType
 from mujoco.mjx import Data, Model
+from mujoco.mjx import kinematics as body_poses
 from mujoco.mjx import step as step
 from mujoco.mjx._src import solver as solver
 

@@ -1,0 +1,247 @@
+"""Write the functions of an environment for web pages: its step, and what a page shows of it.
+
+A robot's state is a row of 32-bit words. The functions, of all robots at once:
+
+    reset     random keys -> states
+    step      states, actions, knobs -> states, with new episodes where one ended
+    move      states, goals -> states, whose episodes begin again with these goals
+    poses     states -> positions and quaternions of the bodies
+    goals     states -> positions of the goals
+    script    states -> actions of the scripted driver
+    frame     states -> what the pixels of the camera's image share, if there is a camera
+    image     that and a table -> bytes
+    draw      random keys -> a standard normal number, and the same between 0 and 1
+
+Knobs are numbers that a visitor may change while the robots drive: the success radius [m], the
+share of the largest speed, and a factor on the friction.
+"""
+
+import functools
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree, UInt32
+
+from jetbot_mjx import envs
+from jetbot_mjx.config import RandomizationConfig, RobotParams
+from jetbot_mjx.deployment.web_scene import encoded
+from jetbot_mjx.envs import Camera, JetBotEnv, State
+from jetbot_mjx.evaluation import BASELINES
+from jetbot_mjx.packed import pack
+from onekernel import Kernel, UnsupportedError, fuse
+from onekernel.build import wasm
+
+KNOBS = ("success_radius", "speed", "friction")
+"""What a visitor may change, in the order of the step's argument."""
+
+
+class WebEnv(NamedTuple):
+    """A `WebEnv` holds the functions of an environment for a web page."""
+
+    texts: Mapping[str, str]
+    """Functions as LLVM modules for `wasm.link`, by name."""
+    about: Mapping[str, Any]
+    """What a script must know of them, as JSON values."""
+
+
+def web_env(env: JetBotEnv, bodies: list[int], *, prefix: str = "robot_", varied: bool = False) -> WebEnv:
+    """Write the functions of an environment.
+
+    Args:
+      env: one environment, unwrapped.
+      bodies: the bodies of its model whose poses are shown.
+      prefix: what the names of the functions begin with.
+      varied: whether robots differ as the section `randomization` says; images are of the plain
+        scene in any case.
+
+    Raises:
+      UnsupportedError: a function cannot be one kernel.
+    """
+    ranges = _without_looks(env.config.randomization) if varied else RandomizationConfig()
+    one = _Robot(env.blind(), ranges)
+    knobs = list(KNOBS)
+    try:
+        step = _kernel(one.step, one.words, one.action, _floats(len(KNOBS)))
+    except (UnsupportedError, TypeError, ValueError, jax.errors.JAXTypeError):
+        # A task may use its settings as plain numbers of Python: then they stay as they are.
+        knobs, step = [], _kernel(one.plain_step, one.words, one.action)
+    key = jax.ShapeDtypeStruct((2,), np.uint32)
+    kernels = {
+        "reset": _kernel(one.reset, key),
+        "step": step,
+        "poses": _kernel(functools.partial(_poses, env, bodies, one), one.words),
+        "goals": _kernel(lambda words: env.task.goal_position(one.state(words).goal), one.words),
+        "script": _kernel(one.scripted, one.words),
+        "draw": _kernel(_draw, key),
+    }
+    if isinstance(env.task, envs.MovesGoal):
+        kernels["move"] = _kernel(one.moved, one.words, _floats(3))
+    if env.camera is not None:
+        image, kernels["frame"] = _image(env.camera, one)
+    texts = {name: wasm.step_text(prefix + name, kernel) for name, kernel in kernels.items()}
+    about = {
+        "prefix": prefix,
+        "functions": list(texts),
+        "words": one.words.shape[0],
+        "places": one.places(),
+        "bodies": len(bodies),
+        "actions": env.action_size,
+        "knobs": knobs,
+        "initial_knobs": [env.config.task.success_radius, 1.0, 1.0],
+    }
+    if env.camera is not None:
+        texts["image"] = wasm.map_text(f"{prefix}image", image)
+        about["image"] = _about_image(env.camera, image)
+    return WebEnv({prefix + name: text for name, text in texts.items()}, about)
+
+
+def _without_looks(ranges: RandomizationConfig) -> RandomizationConfig:
+    """Return the ranges of what differs between robots, without what they see."""
+    return ranges.model_copy(update=dict.fromkeys(ranges.looks))
+
+
+class _Robot:
+    """One robot in the wrappers of a training, as functions of the words of its state."""
+
+    def __init__(self, env: JetBotEnv, ranges: RandomizationConfig) -> None:
+        self.env, self._ranges = env, ranges
+        self._wrapped = self._wrap(env)
+        key = jax.ShapeDtypeStruct((2,), np.uint32)
+        self._like = jax.eval_shape(lambda key: pack(self._wrapped.reset(key)), key)
+        self.words: jax.ShapeDtypeStruct = self._like.words
+        self.action = _floats(env.action_size)
+
+    def _wrap(self, env: JetBotEnv, friction: Array | float = 1.0) -> envs.NewEpisodeWrapper:
+        """Wrap an environment, whose friction is changed by a factor."""
+        params = RobotParams(friction=friction)
+        robot = envs.DomainRandomizationWrapper(env, params, self._ranges)
+        length = env.config.task.episode_length
+        return envs.NewEpisodeWrapper(envs.EpisodeWrapper(robot, length))
+
+    def state(self, words: Float[Array, " words"]) -> State:
+        """Return the state that some words hold; what is not among them is empty."""
+        others = [jnp.zeros(x.shape, x.dtype) for x in self._like.others]
+        return self._like.replace(words=words, others=others).unpack()
+
+    def places(self) -> dict[str, Any]:
+        """Return where the words have what a script reads and writes."""
+        state = self._like.places()
+        info, physics = state.info, state.pipeline_state
+        single = {
+            "reward": state.reward,
+            "done": state.done,
+            "success": state.metrics["success"],
+            "truncation": info["truncation"],
+            "steps": info["steps"],
+        }
+        several = {"obs": state.obs, "qpos": physics.qpos, "qvel": physics.qvel}
+        found = {name: int(place) for name, place in single.items()}
+        # Those of an array are next to each other; there may be no numbers at all.
+        for name, place in several.items():
+            numbers = np.asarray(place if isinstance(place, np.ndarray) else [], int)
+            found[name] = [int(numbers[0]) if numbers.size else 0, numbers.size]
+        return found
+
+    def reset(self, key: UInt32[Array, "2"]) -> Float[Array, " words"]:
+        return pack(self._wrapped.reset(key)).words
+
+    def plain_step(
+        self, words: Float[Array, " words"], action: Float[Array, " action"]
+    ) -> Float[Array, " words"]:
+        return pack(self._wrapped.step(self.state(words), action)).words
+
+    def step(
+        self,
+        words: Float[Array, " words"],
+        action: Float[Array, " action"],
+        knobs: Float[Array, " knobs"],
+    ) -> Float[Array, " words"]:
+        radius, speed, friction = knobs
+        config = self.env.config.task.model_copy(update={"success_radius": radius})
+        env = self.env.with_task(type(self.env.task)(config))
+        wrapped = self._wrap(env, 1.0 if self._ranges.friction else friction)
+        # A share of the speed range is a part of the first action's range.
+        slower = action.at[0].set((jnp.clip(action[0], -1.0, 1.0) + 1.0) * speed - 1.0)
+        return pack(wrapped.step(self.state(words), slower)).words
+
+    def moved(
+        self, words: Float[Array, " words"], position_w: Float[Array, "3"]
+    ) -> Float[Array, " words"]:
+        state, task = self.state(words), self.env.task
+        assert isinstance(task, envs.MovesGoal)
+        goal = task.move_goal(state.goal, position_w)
+        obs = self.env.observe(envs.robot_state(state.pipeline_state), goal)
+        info = {**state.info, "steps": jnp.zeros(())}
+        return pack(state.replace(goal=goal, obs=obs, info=info, done=jnp.zeros(()))).words
+
+    def scripted(self, words: Float[Array, " words"]) -> Float[Array, " action"]:
+        return BASELINES["scripted"](self.env)(None, self.state(words), jnp.zeros(2, np.uint32))
+
+
+def _poses(
+    env: JetBotEnv, bodies: list[int], robot: _Robot, words: Float[Array, " words"]
+) -> Float[Array, "bodies 7"]:
+    """Return position and quaternion of some bodies of the model with visual elements."""
+    state, model = robot.state(words), envs.put_model(env.mj_model)
+    data = envs.make_data(env.mj_model).replace(qpos=state.pipeline_state.qpos)
+    # The task places the mocap bodies.
+    markers, positions = env.task.markers(state.goal), data.mocap_pos
+    for name, index in envs.mocap_ids(env.mj_model).items():
+        if name in markers:
+            positions = positions.at[index].set(markers[name])
+    data = envs.body_poses(model, data.replace(mocap_pos=positions))
+    return jnp.concatenate([data.xpos, data.xquat], axis=1)[np.asarray(bodies)]
+
+
+def _image(camera: Camera, robot: _Robot) -> tuple[Kernel, Kernel]:
+    """Return the kernel of an image, and that of what its pixels share."""
+    structures: list[Hashable] = []
+
+    def frame(words: Float[Array, " words"]) -> Float[Array, " shared"]:
+        state = robot.state(words)
+        body = envs.robot_state(state.pipeline_state)
+        pose = camera.pose(body.position_w, body.quat)
+        shared, structure = camera.shared(pose, dict(robot.env.task.markers(state.goal)))
+        structures.append(structure)
+        return shared
+
+    kernel = _kernel(frame, robot.words)
+    (size,) = kernel.results()[0].shape
+    return camera.make_kernel(structures[0], size), kernel
+
+
+def _about_image(camera: Camera, kernel: Kernel) -> dict[str, Any]:
+    height, width, channels = camera.shape
+    assert kernel.table is not None
+    return {
+        "height": height,
+        "width": width,
+        "channels": channels,
+        "frames": camera.config.frames,
+        "shared": sum(kernel.argument_shapes[0]),
+        "table": encoded(kernel.table),
+    }
+
+
+def _draw(key: UInt32[Array, "2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return a standard normal number, and from the same bits one that is uniform in [0, 1)."""
+    return jax.random.normal(key), jax.random.uniform(key)
+
+
+def _floats(size: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((size,), jnp.float32)
+
+
+def _kernel(function: Callable[..., PyTree], *like: jax.ShapeDtypeStruct) -> Kernel:
+    """Lower a function of one robot.
+
+    Raises:
+      UnsupportedError: it cannot be one kernel.
+    """
+    kernel = fuse(function, on_unsupported="raise").lowered(*like).one
+    if isinstance(kernel, UnsupportedError):
+        raise kernel
+    return kernel
