@@ -17,7 +17,7 @@ share of the largest speed, and a factor on the friction.
 """
 
 import functools
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -38,6 +38,9 @@ KNOBS = ("success_radius", "speed", "friction")
 """What a visitor may change, in the order of the step's argument."""
 
 
+_KEY = jax.ShapeDtypeStruct((2,), np.uint32)
+
+
 class WebEnv(NamedTuple):
     """A `WebEnv` holds the functions of an environment for a web page."""
 
@@ -47,60 +50,73 @@ class WebEnv(NamedTuple):
     """What a script must know of them, as JSON values."""
 
 
-def web_env(env: JetBotEnv, bodies: list[int], *, prefix: str = "robot_", varied: bool = False) -> WebEnv:
-    """Write the functions of an environment.
+def web_env(env: JetBotEnv, bodies: Sequence[int]) -> WebEnv:
+    """Write the functions of an environment whose robots are shown, each as its preset is.
 
     Args:
       env: one environment, unwrapped.
       bodies: the bodies of its model whose poses are shown.
-      prefix: what the names of the functions begin with.
-      varied: whether robots differ as the section `randomization` says; images are of the plain
-        scene in any case.
 
     Raises:
       UnsupportedError: a function cannot be one kernel.
     """
-    ranges = _without_looks(env.config.randomization) if varied else RandomizationConfig()
-    one = _Robot(env.blind(), ranges)
-    knobs = list(KNOBS)
-    try:
-        step = _kernel(one.step, one.words, one.action, _floats(len(KNOBS)))
-    except (UnsupportedError, TypeError, ValueError, jax.errors.JAXTypeError):
-        # A task may use its settings as plain numbers of Python: then they stay as they are.
-        knobs, step = [], _kernel(one.plain_step, one.words, one.action)
-    key = jax.ShapeDtypeStruct((2,), np.uint32)
+    robot = _Robot(env.blind(), RandomizationConfig())
     kernels = {
-        "reset": _kernel(one.reset, key),
-        "step": step,
-        "poses": _kernel(functools.partial(_poses, env, bodies, one), one.words),
-        "goals": _kernel(lambda words: env.task.goal_position(one.state(words).goal), one.words),
-        "script": _kernel(one.scripted, one.words),
-        "draw": _kernel(_draw, key),
+        "poses": _kernel(functools.partial(_poses, env, np.asarray(bodies), robot), robot.words),
+        "goals": _kernel(lambda x: env.task.goal_position(robot.state(x).goal), robot.words),
+        "script": _kernel(robot.scripted, robot.words),
+        "draw": _kernel(_draw, _KEY),
     }
     if isinstance(env.task, envs.MovesGoal):
-        kernels["move"] = _kernel(one.moved, one.words, _floats(3))
-    if env.camera is not None:
-        image, kernels["frame"] = _image(env.camera, one)
-    texts = {name: wasm.step_text(prefix + name, kernel) for name, kernel in kernels.items()}
+        kernels["move"] = _kernel(robot.moved, robot.words, _floats(3))
+    if env.camera is None:
+        return _written("robot_", robot, kernels)
+    # An image is a kernel with a table.
+    image, kernels["frame"] = _image(env.camera, robot)
+    shown = _written("robot_", robot, kernels)
+    texts = {**shown.texts, "robot_image": wasm.map_text("robot_image", image)}
+    return WebEnv(texts, {**shown.about, "image": _about_image(env.camera, image)})
+
+
+def web_training_env(env: JetBotEnv) -> WebEnv:
+    """Write the functions of an environment for a training, with robots that differ as it says.
+
+    Args:
+      env: one environment, unwrapped, which observes numbers.
+
+    Raises:
+      UnsupportedError: a function cannot be one kernel.
+    """
+    return _written("training_", _Robot(env, env.config.randomization), {})
+
+
+def _written(prefix: str, robot: "_Robot", others: Mapping[str, Kernel]) -> WebEnv:
+    """Write reset and step of a robot, and other functions of its state.
+
+    Args:
+      prefix: what the names of the functions begin with.
+      robot: the robot.
+      others: the kernels of the other functions, by name.
+    """
+    knobs = list(KNOBS)
+    try:
+        step = _kernel(robot.step, robot.words, robot.action, _floats(len(KNOBS)))
+    except (UnsupportedError, TypeError, ValueError, jax.errors.JAXTypeError):
+        # A task may use its settings as plain numbers of Python: then they stay as they are.
+        knobs, step = [], _kernel(robot.plain_step, robot.words, robot.action)
+    kernels = {"reset": _kernel(robot.reset, _KEY), "step": step, **others}
+    texts = {prefix + name: wasm.step_text(prefix + name, one) for name, one in kernels.items()}
+    task = robot.env.config.task
     about = {
         "prefix": prefix,
-        "functions": list(texts),
-        "words": one.words.shape[0],
-        "places": one.places(),
-        "bodies": len(bodies),
-        "actions": env.action_size,
+        "functions": list(kernels),
+        "words": robot.words.shape[0],
+        "places": robot.places(),
+        "actions": robot.env.action_size,
         "knobs": knobs,
-        "initial_knobs": [env.config.task.success_radius, 1.0, 1.0],
+        "initial_knobs": [task.success_radius, 1.0, 1.0],
     }
-    if env.camera is not None:
-        texts["image"] = wasm.map_text(f"{prefix}image", image)
-        about["image"] = _about_image(env.camera, image)
-    return WebEnv({prefix + name: text for name, text in texts.items()}, about)
-
-
-def _without_looks(ranges: RandomizationConfig) -> RandomizationConfig:
-    """Return the ranges of what differs between robots, without what they see."""
-    return ranges.model_copy(update=dict.fromkeys(ranges.looks))
+    return WebEnv(texts, about)
 
 
 class _Robot:
@@ -109,8 +125,7 @@ class _Robot:
     def __init__(self, env: JetBotEnv, ranges: RandomizationConfig) -> None:
         self.env, self._ranges = env, ranges
         self._wrapped = self._wrap(env)
-        key = jax.ShapeDtypeStruct((2,), np.uint32)
-        self._like = jax.eval_shape(lambda key: pack(self._wrapped.reset(key)), key)
+        self._like = jax.eval_shape(lambda key: pack(self._wrapped.reset(key)), _KEY)
         self.words: jax.ShapeDtypeStruct = self._like.words
         self.action = _floats(env.action_size)
 
@@ -182,7 +197,7 @@ class _Robot:
 
 
 def _poses(
-    env: JetBotEnv, bodies: list[int], robot: _Robot, words: Float[Array, " words"]
+    env: JetBotEnv, bodies: np.ndarray, robot: _Robot, words: Float[Array, " words"]
 ) -> Float[Array, "bodies 7"]:
     """Return position and quaternion of some bodies of the model with visual elements."""
     state, model = robot.state(words), envs.put_model(env.mj_model)
@@ -193,7 +208,7 @@ def _poses(
         if name in markers:
             positions = positions.at[index].set(markers[name])
     data = envs.body_poses(model, data.replace(mocap_pos=positions))
-    return jnp.concatenate([data.xpos, data.xquat], axis=1)[np.asarray(bodies)]
+    return jnp.concatenate([data.xpos, data.xquat], axis=1)[bodies]
 
 
 def _image(camera: Camera, robot: _Robot) -> tuple[Kernel, Kernel]:

@@ -15,23 +15,25 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 from jetbot_mjx import agents, runs
-from jetbot_mjx.agents import PolicyParams, WebLearner, network_texts, web_learner
+from jetbot_mjx.agents import PolicyParams
 from jetbot_mjx.deployment.numpy_policy import PortablePolicy, portable_policy
 from jetbot_mjx.deployment.policy_spec import policy_spec
-from jetbot_mjx.deployment.web_env import WebEnv, web_env
-from jetbot_mjx.deployment.web_scene import encoded, web_scene
+from jetbot_mjx.deployment.web_functions import web_functions
+from jetbot_mjx.deployment.web_modules import find_module
+from jetbot_mjx.deployment.web_scene import encoded
 from jetbot_mjx.envs import JetBotEnv, layout_data
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import Checkpoint
 from jetbot_mjx.terminal import stage
 from onekernel import KernelError
-from onekernel.build import wasm
 
 _SCRIPTS = {"engine": ("engine.js", "learner.js"), "app": ("scene.js", "app.js")}
 """The scripts of a page; those of `engine` are also the worker's that trains."""
+
+FILE = "page.html"
+"""Name of a page in the run folder."""
 
 _ASSETS = resources.files("jetbot_mjx").joinpath("assets")
 
@@ -40,6 +42,8 @@ class WebPage(NamedTuple):
     """A `WebPage` says what was written."""
 
     path: Path
+    size: int
+    """Bytes of the file."""
     policies: Sequence[str]
     """Names of the policies that the page has."""
     no_learner: str | None
@@ -47,13 +51,16 @@ class WebPage(NamedTuple):
 
 
 def write_web_page(
-    run_or_checkpoint: str | Path, output: str | Path, *, which: runs.Which = "best"
+    run_or_checkpoint: str | Path,
+    output: str | Path | None = None,
+    *,
+    which: runs.Which = "best",
 ) -> WebPage:
     """Write a page of a run's robot, task and policies.
 
     Args:
       run_or_checkpoint: a run folder, or one of its checkpoint folders.
-      output: the file to write, which replaces an earlier one.
+      output: the file to write, which replaces an earlier one; None: `page.html` in the run folder.
       which: the checkpoint of a run folder.
 
     Returns:
@@ -63,13 +70,29 @@ def write_web_page(
       UserError: there is no usable checkpoint, the environment cannot be compiled for pages, the
         linker is missing, or the file cannot be written.
     """
-    checkpoint, path = runs.load_checkpoint(run_or_checkpoint, which), Path(output)
-    with stage("compiling robot, task and policy for web pages"):
+    checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
+    path = checkpoint.results_dir / FILE if output is None else Path(output)
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: name a file with --output, such as {path / FILE}")
+    with runs.writing_to(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with stage("compiling robot, task and policies for web pages"):
         data = page_data(checkpoint)
+    text = page_text(data)
     with runs.writing_to(path):
-        runs.write_text(path, page_text(data))
+        runs.write_text(path, text)
     names = [policy["name"] for policy in data["policies"]]
-    return WebPage(path, names, data["meta"].get("no_learner"))
+    return WebPage(path, len(text.encode()), names, data["meta"]["no_learner"])
+
+
+def summarize_web_page(page: WebPage) -> str:
+    """Return what was written as lines for the terminal."""
+    trains = "can be trained there" if page.no_learner is None else page.no_learner
+    reason = "" if page.no_learner is None else "no training in the page: "
+    return (
+        f"{runs.shortened(page.path)}, {page.size / 1e6:.2f} MB, opens in any browser\n"
+        f"  drivers: {', '.join(page.policies)}, scripted, you; {reason}{trains}"
+    )
 
 
 def page_data(checkpoint: Checkpoint) -> dict[str, Any]:
@@ -82,23 +105,19 @@ def page_data(checkpoint: Checkpoint) -> dict[str, Any]:
       UserError: the environment cannot be compiled for pages, or the linker is missing.
     """
     env = checkpoint.make_env()
-    scene = web_scene(env.mj_model)
     try:
-        robots = web_env(env, scene.bodies)
-        training, learner = _learner(checkpoint, env, robots)
-        texts = {**robots.texts, **network_texts(checkpoint.config.ppo.network.activation)}
-        if not isinstance(learner, str):
-            texts |= {**training.texts, **learner.texts}
-        module = wasm.link(texts)
+        functions = web_functions(checkpoint.config, env)
+        module = find_module(functions.texts)
     except KernelError as error:
         raise UserError(f"no page of {checkpoint.run_dir.name}: {error}") from None
+    robots, learner = functions.robots.about, functions.learner
     final = portable_policy(checkpoint, env)
     meta = {
         **_about(checkpoint, env),
-        "scene": scene.about,
-        "robot_functions": robots.about,
-        "image": robots.about.get("image"),
-        "training_functions": training.about,
+        "scene": functions.scene.about,
+        "robot_functions": robots,
+        "image": robots.get("image"),
+        "training_functions": functions.training.about,
         "learner": None if isinstance(learner, str) else learner.about,
         "no_learner": learner if isinstance(learner, str) else None,
         "export": _export(checkpoint, env, final),
@@ -108,23 +127,6 @@ def page_data(checkpoint: Checkpoint) -> dict[str, Any]:
         "module": base64.b64encode(module).decode(),
         "policies": _policies(checkpoint, env, final),
     }
-
-
-def _learner(
-    checkpoint: Checkpoint, env: JetBotEnv, robots: WebEnv
-) -> tuple[WebEnv, WebLearner | str]:
-    """Return environment and learner of a training, or why a page cannot train."""
-    config = checkpoint.config
-    learner = web_learner(config.ppo, env.observation_size, env.action_size)
-    if isinstance(learner, str):
-        return robots, learner
-    size = learner.about["shape"]["observations"]
-    smallest = np.asarray(env.observation_min_std if config.ppo.normalizer == "physical" else 0.0)
-    about = {**learner.about, "smallest_deviations": np.broadcast_to(smallest, size).tolist()}
-    # A page shows the robot as its preset is; a training may have robots that differ.
-    varies = bool(config.randomization.drawn)
-    training = web_env(env, [], prefix="training_", varied=True) if varies else robots
-    return training, learner._replace(about=about)
 
 
 def _about(checkpoint: Checkpoint, env: JetBotEnv) -> dict[str, Any]:

@@ -331,8 +331,8 @@ class Fleet {
     const { meta } = engine, memory = new Memory(engine.module);
     Object.assign(this, { meta, memory, count, time: 0, network: null, policy: null, scripted: false });
     this.robots = new Robots(memory, meta.robot_functions, count);
-    const { bodies, actions } = meta.robot_functions;
-    this.shown = { poses: memory.array(count * bodies * 7), goals: memory.array(count * 3) };
+    const { actions } = meta.robot_functions;
+    this.shown = { poses: memory.array(count * meta.scene.bodies * 7), goals: memory.array(count * 3) };
     this.keys = memory.array(2 * count, Uint32Array);
     this.one = { words: memory.array(meta.robot_functions.words), goal: memory.array(3) };
     this.manual = new Map();
