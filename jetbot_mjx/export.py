@@ -11,6 +11,7 @@ in any browser, and another one can be trained there. Nothing needs to be instal
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from jetbot_mjx import cli, startup
 
@@ -74,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _write_page(run: str, options: argparse.Namespace) -> int:
+def _write_page(run: Path, options: argparse.Namespace) -> int:
     with startup.exit_on_interrupt():
         from jetbot_mjx.deployment import summarize_web_page, write_web_page
     cli.prepare_device()

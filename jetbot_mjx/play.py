@@ -4,6 +4,7 @@ Without RUN, a policy that comes with the package drives.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 from jetbot_mjx import cli, startup
@@ -68,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _open_page(run: str, which: Literal["best", "last"] | int) -> int:
+def _open_page(run: Path, which: Literal["best", "last"] | int) -> int:
     """Write the page of a run, and open it in the browser."""
     with startup.exit_on_interrupt():
         import webbrowser

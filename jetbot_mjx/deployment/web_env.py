@@ -153,7 +153,7 @@ class _Robot:
             "steps": info["steps"],
         }
         several = {"obs": state.obs, "qpos": physics.qpos, "qvel": physics.qvel}
-        found = {name: int(place) for name, place in single.items()}
+        found: dict[str, Any] = {name: int(place) for name, place in single.items()}
         # Those of an array are next to each other; there may be no numbers at all.
         for name, place in several.items():
             numbers = np.asarray(place if isinstance(place, np.ndarray) else [], int)
@@ -177,7 +177,7 @@ class _Robot:
         radius, speed, friction = knobs
         config = self.env.config.task.model_copy(update={"success_radius": radius})
         env = self.env.with_task(type(self.env.task)(config))
-        wrapped = self._wrap(env, 1.0 if self._ranges.friction else friction)
+        wrapped = self._wrap(env, 1.0 if "friction" in self._ranges.drawn else friction)
         # A share of the speed range is a part of the first action's range.
         slower = action.at[0].set((jnp.clip(action[0], -1.0, 1.0) + 1.0) * speed - 1.0)
         return pack(wrapped.step(self.state(words), slower)).words

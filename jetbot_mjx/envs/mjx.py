@@ -17,7 +17,6 @@ from jetbot_mjx.devices import default_device_cpu
 from mujoco import mjx
 from mujoco.mjx import ConeType as ConeType
 from mujoco.mjx import Data, Model
-from mujoco.mjx import kinematics as body_poses
 from mujoco.mjx import step as step
 from mujoco.mjx._src import solver as solver
 
@@ -35,6 +34,11 @@ def make_data(model: mujoco.MjModel) -> Data:
     """Return MJX's simulation data before the first step, as uncommitted arrays."""
     with jax.ensure_compile_time_eval(), default_device_cpu() as device:
         return _uncommitted(mjx.make_data(model, device=device))
+
+
+def body_poses(model: Model, data: Data) -> Data:
+    """Return the data with positions and attitudes of all bodies, from `qpos` and `mocap_pos`."""
+    return mjx.kinematics(model, data)
 
 
 def _uncommitted(tree: _Tree) -> _Tree:
