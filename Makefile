@@ -69,7 +69,7 @@ benchmark: setup
 
 # Writes the WebAssembly modules of the policies that come with the package; needs LLVM's linker, wasm-ld.
 wasm: $(STAMP)
-	$(BIN)/python -c 'from jetbot_mjx.deployment import store_modules; store_modules()'
+	$(BIN)/python -c 'from jetbot_mjx.deployment.web_modules import store_modules; store_modules()'
 
 # Into site/index.html, with pages of the policies that come with the package in site/demo/; a warning is an error. The
 # variable silences an advertisement.

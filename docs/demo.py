@@ -7,8 +7,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from mkdocs.structure.files import File, Files
-
 from jetbot_mjx.deployment import write_web_page
 
 PAGES = {
@@ -19,8 +17,10 @@ PAGES = {
 """Policies by the name of the page."""
 
 
-def on_files(files: Files, config: Any) -> Files:
-    """Add the pages to the files of the site."""
+def on_files(files: Any, *, config: Any) -> Any:
+    """Add the pages to the files of the site; MkDocs calls this."""
+    from mkdocs.structure.files import File
+
     with tempfile.TemporaryDirectory() as folder:
         for name, policy in PAGES.items():
             page = write_web_page(f"pretrained:{policy}", Path(folder, f"{name}.html"))
