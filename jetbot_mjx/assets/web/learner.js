@@ -206,16 +206,25 @@ class TrainingWorker {
     Object.assign(this, { send, running: false, seconds: 0, knobs: null });
   }
 
-  /** Takes a message of `Learner`. */
+  /** Takes a message of `Learner`, in the order in which they come. */
   async receive({ kind, ...given }) {
-    if (kind === "load") {
-      this.engine = await Engine.load(given.module, given.meta);
-      this.trainer = new Trainer(this.engine, given.seed);
-      this.examination = new Examination(this.engine, EXAMINED_GOALS);
-      this.calls = 0;
-      this.report();
-    } else if (kind === "knobs") this.setKnobs(given.settings);
-    else this.run(kind === "start");
+    try {
+      if (kind === "load") this.loaded = this.load(given);
+      await this.loaded;
+      if (kind === "knobs") this.setKnobs(given.settings);
+      if (kind === "start" || kind === "pause") await this.run(kind === "start");
+    } catch (error) {
+      this.running = false;
+      this.send({ error: error.message });
+    }
+  }
+
+  async load({ module, meta, seed }) {
+    const engine = await Engine.load(module, meta);
+    this.trainer = new Trainer(engine, seed);
+    this.examination = new Examination(engine, EXAMINED_GOALS);
+    this.calls = 0;
+    this.report();
   }
 
   setKnobs(settings) {
@@ -223,15 +232,11 @@ class TrainingWorker {
     this.examination.fleet.robots.settings.splice(0, settings.length, ...settings);
   }
 
-  run(running) {
+  /** Makes training steps until it is told to pause, with room between them for messages. */
+  async run(running) {
     const begins = running && !this.running;
     this.running = running;
-    if (begins) this.go();
-  }
-
-  /** Makes training steps, with room between them for messages. */
-  async go() {
-    while (this.running) {
+    while (begins && this.running) {
       const begin = performance.now();
       this.trainer.step();
       this.seconds += (performance.now() - begin) / 1000;
@@ -260,7 +265,8 @@ class Learner {
   }
 
   #receive(progress) {
-    const { reached, goals } = progress;
+    const { error, reached, goals } = progress;
+    if (error !== undefined) return this.onerror?.(error);
     this.latest = { ...progress, success: reached / goals, interval: wilson(reached, goals) };
     this.onprogress?.(this.latest);
   }
