@@ -203,7 +203,7 @@ const EXAMINED_EVERY = 4;
 /** The worker: trains until it is told to stop, and tells the page how far it is. */
 class TrainingWorker {
   constructor(send) {
-    Object.assign(this, { send, running: false, seconds: 0, knobs: null });
+    Object.assign(this, { send, running: false, busy: false, seconds: 0 });
   }
 
   /** Takes a message of `Learner`, in the order in which they come. */
@@ -234,15 +234,17 @@ class TrainingWorker {
 
   /** Makes training steps until it is told to pause, with room between them for messages. */
   async run(running) {
-    const begins = running && !this.running;
     this.running = running;
-    while (begins && this.running) {
+    if (!running || this.busy) return;
+    this.busy = true;
+    while (this.running) {
       const begin = performance.now();
       this.trainer.step();
       this.seconds += (performance.now() - begin) / 1000;
       if (++this.calls % EXAMINED_EVERY === 0) this.report();
       await new Promise((resolve) => setTimeout(resolve));
     }
+    this.busy = false;
   }
 
   report() {
