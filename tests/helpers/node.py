@@ -35,7 +35,8 @@ const told = (_, value) => ArrayBuffer.isView(value)
   : value;
 // A script sees the classes and functions of those before it.
 const last = sources.map((source) => vm.runInThisContext(source)).pop();
-Promise.resolve(last(given)).then((result) => fs.writeSync(1, JSON.stringify(result ?? null, told)));
+Promise.resolve(last(given)).then((result) =>
+  fs.writeFileSync(1, JSON.stringify(result ?? null, told)));
 """
 
 
