@@ -26,7 +26,7 @@ def _formats(text: str) -> list[str]:
         if name not in (*_FORMATS, "all", _WEB):
             known = ", ".join([*_FORMATS, "all", _WEB])
             raise argparse.ArgumentTypeError(f"{name!r} is not one of {known}")
-    return list(_FORMATS) if "all" in names else names
+    return [*_FORMATS, *({_WEB} & {*names})] if "all" in names else names
 
 
 def _parser() -> cli.Parser:

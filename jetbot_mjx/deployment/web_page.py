@@ -9,6 +9,7 @@ import base64
 import hashlib
 import html
 import json
+import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -74,12 +75,12 @@ def write_web_page(
     path = checkpoint.results_dir / FILE if output is None else Path(output)
     if path.is_dir():
         raise UserError(f"{path} is a folder: name a file with --output, such as {path / FILE}")
-    with runs.writing_to(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    runs.check_writable(path.parent)
     with stage("compiling robot, task and policies for web pages"):
         data = page_data(checkpoint)
     text = page_text(data)
     with runs.writing_to(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
         runs.write_text(path, text)
     names = [policy["name"] for policy in data["policies"]]
     return WebPage(path, len(text.encode()), names, data["meta"]["no_learner"])
@@ -243,9 +244,8 @@ def page_text(data: Mapping[str, Any]) -> str:
         "data": json_text,
         **scripts,
     }
-    for name, part in parts.items():
-        text = text.replace("{{" + name + "}}", part, 1)
-    return text
+    # All at once: a part may hold what looks like the place of another one.
+    return re.sub(r"{{(\w+)}}", lambda place: parts[place[1]], text)
 
 
 def _security_policy(scripts: Sequence[str] | Any, style: str) -> str:
