@@ -121,6 +121,24 @@ def test_an_update_is_given_what_the_packages_is(steps, fused, page):
     assert np.all(given["progress"][0, 3:] == 0)
 
 
+def test_the_first_parameters_are_drawn_as_they_should_be(page):
+    body = "return given.seeds.map((seed) => new Trainer(engine, seed).arrays.params.view.slice());"
+    first, other = page.run(body, seeds=[SEED, SEED + 1])
+    left = np.ones(len(first), bool)
+    for entry in page.data["meta"]["learner"]["initial"]:
+        place = slice(entry["start"], entry["start"] + entry["count"])
+        left[place] = False
+        if "value" in entry:
+            np.testing.assert_array_equal(first[place], np.float32(entry["value"]))
+            continue
+        shares = np.sort(first[place]) / entry["limit"]
+        # Uniform from -1 to 1, by the statistic of Kolmogorov and Smirnov.
+        uniform = np.linspace(-1, 1, len(shares))
+        assert np.abs(shares - uniform).max() < 2 * 2 / np.sqrt(len(shares))
+        assert abs(np.corrcoef(first[place], other[place])[0, 1]) < 4 / np.sqrt(len(shares))
+    assert np.all(first[left] == 0)
+
+
 # More steps than an episode has.
 COLLECTIONS = 18
 
