@@ -17,6 +17,7 @@ from helpers.untrained import write_untrained_run
 from jetbot_mjx import export, play
 from jetbot_mjx.config import load_config
 from jetbot_mjx.deployment import web_page
+from jetbot_mjx.deployment.web_functions import WebFunctions, web_functions
 from jetbot_mjx.deployment.web_modules import stored_hashes
 from jetbot_mjx.deployment.web_page import page_text, write_web_page
 from jetbot_mjx.deployment.web_scene import web_scene
@@ -119,6 +120,19 @@ def test_whatever_a_run_is_called_is_text(title):
     assert parts.policy() == usual.policy()
 
 
+@pytest.fixture
+def functions_once(monkeypatch):
+    """The functions of a page are written once, for all pages of one configuration."""
+    written = []
+
+    def once(*given):
+        written[:] = written or [web_functions(*given)]
+        return written[0]
+
+    monkeypatch.setattr(web_page, "web_functions", once)
+
+
+@pytest.mark.usefixtures("functions_once")
 def test_a_page_of_a_run_is_small_and_has_its_policies(here, capfd):
     # An early checkpoint, one in between, and the last.
     run, config = here / "run", load_config("jetbot_egocentric")
@@ -197,9 +211,11 @@ def test_a_place_that_cannot_be_written_is_told(refused, here):
     assert "file cannot be written: Not a directory" in said
 
 
-def test_without_a_linker_a_network_of_another_size_is_refused_with_the_remedy(
+def test_without_a_linker_other_functions_are_refused_with_the_remedy(
     trained, refused, monkeypatch
 ):
+    functions = WebFunctions({"own": "a module that is not stored"}, *[None] * 4)
+    monkeypatch.setattr(web_page, "web_functions", lambda *_: functions)
     monkeypatch.setattr(shutil, "which", lambda _: None)
     wasm._linker.cache_clear()
     try:

@@ -4,7 +4,6 @@ import jax
 import numpy as np
 import pytest
 
-from helpers.further import slow_unless
 from helpers.untrained import write_untrained_run
 from helpers.web_pages import page_of
 from jetbot_mjx.config import load_config
@@ -53,7 +52,8 @@ def linked_page(folder, config):
 
 @pytest.mark.cpu
 @pytest.mark.skipif(cpu.obstacle() is not None, reason="there are no kernels for this CPU")
-@pytest.mark.parametrize("name", slow_unless(lambda name: name == "obstacle", OWN))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OWN)
 def test_robots_and_tasks_of_ones_own_drive_and_learn(name, root, tmp_path):
     page = linked_page(tmp_path / name, load_config(root / "examples" / f"{name}.yaml", SMALL))
     env, meta = page.env, page.data["meta"]

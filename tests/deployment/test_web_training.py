@@ -242,20 +242,29 @@ def test_the_same_seed_is_the_same_training(page):
     assert np.isfinite(one["params"]).all()
 
 
-# A worker in the same thread, whose messages are copies as those of a browser.
+# A worker in the same thread, whose messages are copies as those of a browser. Each loop of a
+# training waits for a timer without a delay between two steps.
 LEARNER = """
+const later = globalThis.setTimeout;
+let loops = 0, mostLoops = 0;
+globalThis.setTimeout = (act, delay) => {
+  if (delay !== undefined) return later(act, delay);
+  mostLoops = Math.max(mostLoops, ++loops);
+  return later(() => { loops--; act(); });
+};
 globalThis.document = { getElementById: () => ({ textContent: "" }) };
 const workers = [];
 globalThis.Worker = class {
   constructor() {
     workers.push(this);
-    const tell = (message) => setTimeout(() => this.onmessage({ data: structuredClone(message) }));
+    const tell = (message) => later(() => this.onmessage({ data: structuredClone(message) }));
     this.inner = new TrainingWorker(tell);
   }
   postMessage(message) { this.inner.receive(structuredClone(message)); }
   terminate() { this.inner.running = false; }
 };
-const { meta } = given.data, module = bytesOf(given.data.module);
+// Short examinations.
+const meta = { ...given.data.meta, episode_seconds: 1 }, module = bytesOf(given.data.module);
 const learner = new Learner({ meta, module }, { seed: given.seed });
 const told = [], waiting = [];
 learner.onprogress = (progress) => {
@@ -295,7 +304,7 @@ def training(page, observations):
     learner.start();
     await reports(still + 1);
     learner.stop();
-    return {{ told, files, actions, paused, still }};
+    return {{ told, files, actions, paused, still, mostLoops }};
     """
     return page.run(body, seed=SEED, obs=observations.ravel())
 
@@ -321,6 +330,7 @@ def test_a_training_is_paused_goes_on_and_takes_what_a_visitor_changes(training,
     told = training["told"]
     assert training["paused"] == training["still"]
     # One loop makes the steps, however often it is started.
+    assert training["mostLoops"] == 1
     batch = page.data["meta"]["learner"]["batch"]
     each = 4 * batch["collected"] * batch["time"]
     assert [report["steps"] for report in told] == [each * i for i in range(len(told))]
