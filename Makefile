@@ -11,7 +11,7 @@ STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 SB3_STAMP := $(VENV)/.installed-sb3
 
-.PHONY: setup sb3 train test test-gpu test-slow check notebooks format benchmark docs wheel clean
+.PHONY: setup sb3 train test test-gpu test-slow check notebooks format benchmark docs wasm wheel clean
 
 setup: $(STAMP)
 
@@ -67,7 +67,12 @@ format: setup
 benchmark: setup
 	$(BIN)/python benchmarks/steps_per_second.py
 
-# Into site/index.html; a warning is an error. The variable silences an advertisement.
+# Writes the WebAssembly modules of the policies that come with the package; needs LLVM's linker, wasm-ld.
+wasm: $(STAMP)
+	$(BIN)/python -c 'from jetbot_mjx.deployment.web_modules import store_modules; store_modules()'
+
+# Into site/index.html, with pages of the policies that come with the package in site/demo/; a warning is an error. The
+# variable silences an advertisement.
 docs: $(DOCS_STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 

@@ -4,24 +4,29 @@
 write files for runtimes, and `all` writes all of them. The folder also holds `policy.json`, which
 describes every input and output, and the observations on which each file was checked against JAX.
 If a file differs from JAX by more than the tolerance, nothing is written.
+
+`--format web` writes one page instead, `--output` is its file: the policy drives up to 1,024 robots
+in any browser, and another one can be trained there. Nothing needs to be installed to open it.
 """
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from jetbot_mjx import cli, startup
 
 _FORMATS = ("numpy", "onnx", "stablehlo")
-_FOLDER = "policy"
+_WEB = "web"
+_FOLDER, _PAGE = "policy", "page.html"
 
 
 def _formats(text: str) -> list[str]:
     names = text.split(",")
     for name in names:
-        if name not in (*_FORMATS, "all"):
-            known = ", ".join([*_FORMATS, "all"])
+        if name not in (*_FORMATS, "all", _WEB):
+            known = ", ".join([*_FORMATS, "all", _WEB])
             raise argparse.ArgumentTypeError(f"{name!r} is not one of {known}")
-    return list(_FORMATS) if "all" in names else names
+    return [*_FORMATS, *({_WEB} & {*names})] if "all" in names else names
 
 
 def _parser() -> cli.Parser:
@@ -31,10 +36,11 @@ def _parser() -> cli.Parser:
         "--format",
         type=_formats,
         action="extend",
-        metavar="|".join([*_FORMATS, "all"]),
+        metavar="|".join([*_FORMATS, "all", _WEB]),
         help="file format to write, or several with commas between them (default: numpy)",
     )
-    cli.add_output(parser, f"folder to write (default: RUN/{_FOLDER})")
+    places = f"folder to write (default: RUN/{_FOLDER}); of a page its file (RUN/{_PAGE})"
+    cli.add_output(parser, places)
     return parser
 
 
@@ -47,19 +53,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    formats = tuple(dict.fromkeys(options.format or ("numpy",)))
+    if _WEB in formats and len(formats) > 1:
+        parser.error("--format web writes a page, not a folder: give it alone")
     run = cli.find_policy(options.run)
+    if _WEB in formats:
+        return _write_page(run, options)
     with startup.exit_on_interrupt():
         from jetbot_mjx.deployment import export_policy, summarize_export
     cli.prepare_device()
     with cli.show_progress():
         exported = export_policy(
             run,
-            formats=tuple(dict.fromkeys(options.format or ("numpy",))),
+            formats=formats,
             which=options.which,
             output=options.output,
         )
     cli.tell(summarize_export(exported))
+    return 0
+
+
+def _write_page(run: Path, options: argparse.Namespace) -> int:
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.deployment import summarize_web_page, write_web_page
+    cli.prepare_device()
+    with cli.show_progress():
+        page = write_web_page(run, options.output, which=options.which)
+    cli.tell(summarize_web_page(page))
     return 0
 
 

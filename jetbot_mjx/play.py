@@ -4,6 +4,8 @@ Without RUN, a policy that comes with the package drives.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
 
 from jetbot_mjx import cli, startup
 
@@ -20,6 +22,8 @@ def _parser() -> cli.Parser:
     cli.add_choice(parser, "--viewer", ("browser", "native"), viewers)
     cli.add_choice(parser, "--agent", _AGENTS, "initial driver; the page can switch it")
     cli.add_count(parser, "--seed", "random seed of the goals", least=0, default=0)
+    web = "open a page that needs no server, in which another policy can be trained"
+    parser.add_argument("--web", action="store_true", help=web)
     # At most as many as two CPU cores still drive in real time.
     cli.add_count(parser, "--robots", "number of robots that drive at once", most=256, default=1)
     parser.add_argument(
@@ -53,6 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = vars(_parser().parse_args(arguments))
     given = options.pop("run")
     run = cli.find_policy(given or f"pretrained:{_DEFAULT_POLICY}")
+    if options.pop("web"):
+        return _open_page(run, options["which"])
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import play_live
     cli.prepare_device()
@@ -60,6 +66,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cli.tell(f"no RUN given: playing pretrained:{_DEFAULT_POLICY}")
     successes, episodes = play_live(run, **options, tell=cli.tell)
     cli.tell(f"{successes} of {episodes} goals reached")
+    return 0
+
+
+def _open_page(run: Path, which: Literal["best", "last"] | int) -> int:
+    """Write the page of a run, and open it in the browser."""
+    with startup.exit_on_interrupt():
+        import webbrowser
+
+        from jetbot_mjx.deployment import summarize_web_page, write_web_page
+    cli.prepare_device()
+    with cli.show_progress():
+        page = write_web_page(run, which=which)
+    cli.tell(summarize_web_page(page))
+    if not webbrowser.open(page.path.resolve().as_uri()):
+        cli.tell("no browser was found: open this file in one")
     return 0
 
 

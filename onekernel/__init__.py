@@ -32,6 +32,7 @@ The parts, each of which imports only from those before it:
 - `codegen`: these blocks to LLVM IR
 - `kernel`: a kernel as a JAX primitive; `errors`: what it raises
 - `cpu`, `gpu`: these to machine code and PTX, and its launch by XLA; `backends`: both
+- `wasm`: these to WebAssembly, whose functions a web page calls
 - `check`: a kernel's results beside XLA's
 - `fused`: a function of one instance as one kernel, with another kernel inside
 - `explanation`: what the compiler made of it

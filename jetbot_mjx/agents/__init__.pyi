@@ -2,6 +2,9 @@ from .brax_parts import UInt64 as UInt64
 from .cnn_sizes import CNNS as CNNS
 from .cnn_sizes import activation_bytes as activation_bytes
 from .cnn_sizes import is_image as is_image
+from .fused.web import WebLearner as WebLearner
+from .fused.web import network_texts as network_texts
+from .fused.web import web_learner as web_learner
 from .learner import DeviceAxis as DeviceAxis
 from .networks import Networks as Networks
 from .networks import Observation as Observation

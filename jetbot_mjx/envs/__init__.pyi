@@ -22,7 +22,9 @@ from .kinematics import to_body as to_body
 from .kinematics import turned as turned
 from .kinematics import yaw as yaw
 from .mjcf_wheels import guess_section as guess_section
+from .mjx import body_poses as body_poses
 from .mjx import make_data as make_data
+from .mjx import put_model as put_model
 from .mujoco_env import MujocoJetBot as MujocoJetBot
 from .mujoco_env import Observation as Observation
 from .mujoco_simulator import OTHER_NUMERICS as OTHER_NUMERICS
@@ -38,6 +40,7 @@ from .robot_facts import training_hints as training_hints
 from .robot_model import QPOS_QUAT as QPOS_QUAT
 from .robot_model import QPOS_XYZ as QPOS_XYZ
 from .robot_model import make_mj_model as make_mj_model
+from .robot_model import mocap_ids as mocap_ids
 from .robot_template import write_robot_template as write_robot_template
 from .state import State as State
 from .state import robot_state as robot_state
@@ -58,4 +61,5 @@ from .versions import installed_version as installed_version
 from .wrappers import BatchWrapper as BatchWrapper
 from .wrappers import EpisodeWrapper as EpisodeWrapper
 from .wrappers import KernelWrapper as KernelWrapper
+from .wrappers import NewEpisodeWrapper as NewEpisodeWrapper
 from .wrappers import wrap_for_training as wrap_for_training

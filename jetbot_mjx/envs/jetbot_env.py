@@ -175,7 +175,15 @@ class JetBotEnv(Env):
         """
         return self._with(physics=physics)
 
-    def _with(self, **changed: Camera | Physics | None) -> "JetBotEnv":
+    def with_task(self, task: Task) -> "JetBotEnv":
+        """Return a copy of this environment with another task.
+
+        Args:
+          task: a task of the same scene, for example with another success radius.
+        """
+        return self._with(task=task)
+
+    def _with(self, **changed: Camera | Physics | Task | None) -> "JetBotEnv":
         """Return a copy of this environment with other attributes."""
         env = copy.copy(self)
         vars(env).update(changed)

@@ -36,6 +36,11 @@ def make_data(model: mujoco.MjModel) -> Data:
         return _uncommitted(mjx.make_data(model, device=device))
 
 
+def body_poses(model: Model, data: Data) -> Data:
+    """Return the data with positions and attitudes of all bodies, from `qpos` and `mocap_pos`."""
+    return mjx.kinematics(model, data)
+
+
 def _uncommitted(tree: _Tree) -> _Tree:
     """Return arrays that JAX may move to any device."""
     # `jnp.asarray` would compile a program for every shape.

@@ -1,6 +1,6 @@
 """Write kernels around a lowered function, as LLVM IR that the back ends compile and launch."""
 
-from onekernel import cpu, gpu
+from onekernel import cpu, gpu, wasm
 from onekernel.backends import BACKENDS
 from onekernel.background import in_background
 from onekernel.codegen import LlvmWriter, Repeat, Value, run_program
@@ -27,4 +27,5 @@ __all__ = [
     "run_program",
     "scalarize",
     "unroll_linear_algebra",
+    "wasm",
 ]

@@ -27,6 +27,7 @@ from onekernel.cpu.xla_call import BLOCK_PARAMETERS as BLOCK_PARAMETERS
 from onekernel.cpu.xla_call import array_of as array_of
 from onekernel.cpu.xla_call import call_text as call_text
 from onekernel.cpu.xla_call import instance_count as instance_count
+from onekernel.cpu.xla_call import job_of_one as job_of_one
 from onekernel.cpu.xla_call import step_functions as step_functions
 from onekernel.kernel import Compiled, Kernel, probe
 from onekernel.trusted_files import cached_bytes

@@ -11,7 +11,7 @@ its size, and the function returns without a result if a size differs from the e
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
 
 from onekernel.codegen import STEP, LlvmWriter, Value, map_function, module_text, tile_function
@@ -121,6 +121,20 @@ def array_of(job: Value, place: int) -> Value:
     """Return the address of one of the arrays of a job: first the arguments, then the results."""
     # Behind these numbers come the addresses of the arrays.
     return job.at(5 + place, "u64").load("ptr")
+
+
+def job_of_one(arrays: Sequence[Value]) -> Value:
+    """Return the address of a job of one instance, for calls of `block` by others than XLA.
+
+    Args:
+      arrays: the addresses of the arrays.
+    """
+    w = arrays[0].writer
+    job = w.allocate(5 + len(arrays), "u64", align=8)
+    job.at(4, "u64").store(w.constant(1, "u64"))
+    for i, address in enumerate(arrays):
+        job.at(5 + i, "u64").store(address)
+    return job
 
 
 def _step_block(kernel: Kernel, lanes: int) -> LlvmWriter:

@@ -38,6 +38,9 @@ def load(path):
 
 reference = load(DOCS / "reference.py")
 
+DEMO = {f"demo/{name}.html" for name in load(DOCS / "demo.py").PAGES}
+"""Pages of policies, which the build writes."""
+
 PAGES = {
     str(path.relative_to(DOCS)): reference.with_tables(path.read_text("utf-8"))
     for path in DOCS.rglob("*.md")

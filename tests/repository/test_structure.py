@@ -42,13 +42,13 @@ which are for others' programs, or `startup`, which is for commands."""
 
 
 ENGINE_ORDER = (
-    *("errors", "background", "trusted_files", "lower", "codegen", "kernel", "cpu", "gpu"),
+    *("errors", "background", "trusted_files", "lower", "codegen", "kernel", "cpu", "gpu", "wasm"),
     *("backends", "round_off", "check", "fused", "explanation", "aot", "build"),
     "mujoco",
 )
 """Modules and rooms of the engine: each imports only itself and those before it."""
 
-ENGINE_ROOMS = ("lower", "codegen", "cpu", "gpu", "aot", "build")
+ENGINE_ROOMS = ("lower", "codegen", "cpu", "gpu", "wasm", "aot", "build")
 
 FACES = {
     ENGINE: 10,

@@ -34,6 +34,7 @@ TOGETHER = {
     "commands/test_play": "viewers.live",
     "commands/test_render": "viewers.gallery",
     "commands/test_replay": "runs.nan_dump",
+    "commands/test_web_page": "deployment.web_page deployment.web_scene",
     "config/test_files": "config.errors",
     "config/test_load": "config.evaluation config.task",
     "config/test_quantities": "config.look_quantities config.randomization config.robot_quantities",

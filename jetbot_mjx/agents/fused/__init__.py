@@ -30,4 +30,8 @@ On CPUs:
 - `cpu_gradient`: the stages of the gradient, one for each network and the sum
 - `cpu_adam`: the stages of Adam, and all minibatches as one call
 - `launch_cpu`: their launch
+
+For web pages:
+
+- `web`: the kernels of CPUs as WebAssembly, and what a script must know of them
 """

@@ -55,17 +55,35 @@ class Call:
 
     def text(self, host: cpu.Host) -> str:
         """Return the LLVM module for a processor."""
+        return cpu.call_text(
+            [self._needed(), *self.functions(host.lanes, host.registers)],
+            blocks_per_instance=self.blocks,
+            blocks_per_thread=1,
+            scratch=self.scratch,
+            machine=host.machine,
+        )
+
+    def functions(self, lanes: int, registers: int) -> list[LlvmWriter]:
+        """Write the function `block`, which computes a block, and those that it calls.
+
+        Args:
+          lanes: the number of float32 values in a vector register.
+          registers: the number of vector registers.
+        """
         # Stages share some functions, which are in the module once.
         stages = [stage for together in self.stages for stage in together]
         functions = [function for stage in stages for function in stage.functions(self)]
-        functions += [*product_functions(host.lanes, host.registers), self._needed(), self._block()]
-        return cpu.call_text(
-            functions,
-            blocks_per_instance=self._parts * self.minibatches,
-            blocks_per_thread=1,
-            scratch=max(64 * -(-stage.scratch // 16) for stage in stages),
-            machine=host.machine,
-        )
+        return [*functions, *product_functions(lanes, registers), self._block()]
+
+    @property
+    def blocks(self) -> int:
+        """Return the number of blocks of a policy."""
+        return self._parts * self.minibatches
+
+    @property
+    def scratch(self) -> int:
+        """Return the bytes of scratch memory of a thread, a multiple of 64."""
+        return max(64 * -(-stage.scratch // 16) for together in self.stages for stage in together)
 
     def array(self, job: Value, policy: Value, name: str) -> Value:
         """Return the address of the array of a policy."""

@@ -33,14 +33,22 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
       batch: the minibatch.
     """
     # Whether there is a compiler at all, and then the sizes that the stages can take.
-    if obstacle := cpu.obstacle():
-        return obstacle
+    return cpu.obstacle() or misfit(shape, batch, cpu.host_processor().lanes)
+
+
+def misfit(shape: UpdateShape, batch: Minibatch, lanes: int) -> str | None:
+    """Return which size the kernels cannot take, or None.
+
+    Args:
+      shape: the networks.
+      batch: the minibatch.
+      lanes: the number of float32 values in a vector register.
+    """
     outputs = max(shape.outputs)
     if outputs > HEAD:
         return f"it takes at most {HEAD} outputs, not {outputs}"
     if shape.width % _WIDTH_STEP:
         return f"it takes layers of 16, 32, 48, ... units, not {shape.width}"
-    lanes = cpu.host_processor().lanes
     if max(4 * x.scratch for x, *_ in gradient_stages(shape, batch, lanes)) > _MOST_MEMORY:
         return f"unrolls of {batch.time} steps do not fit in {_MOST_MEMORY >> 20} MiB"
     return None
@@ -60,8 +68,15 @@ NAMES: Collection[str] = frozenset(_STAGES)
 """Names of the kernels, as in `launch.Launcher`."""
 
 
-def _call(kernel: Signature, spec: Spec, batch: Minibatch, lanes: int) -> Call:
-    """Return the call of a kernel."""
+def call_of(kernel: Signature, spec: Spec, batch: Minibatch, lanes: int) -> Call:
+    """Return the call of a kernel.
+
+    Args:
+      kernel: the kernel.
+      spec: what it is written for.
+      batch: the data, from `Signature.relevant`.
+      lanes: the number of float32 values in a vector register.
+    """
     stages = _STAGES[kernel.name](spec, batch, lanes)
     sizes = kernel.counts(spec, batch)
     # Behind the results come the arrays between the stages, for which XLA finds memory.
@@ -77,7 +92,7 @@ def _call(kernel: Signature, spec: Spec, batch: Minibatch, lanes: int) -> Call:
 
 def _written(host: cpu.Host, kernel: Signature, spec: Spec, batch: Minibatch) -> str:
     """Write the LLVM module of a kernel."""
-    return _call(kernel, spec, batch, host.lanes).text(host)
+    return call_of(kernel, spec, batch, host.lanes).text(host)
 
 
 _written_once = functools.cache(_written)
@@ -103,7 +118,7 @@ def launch(kernel: Signature, spec: Spec, batch: Minibatch, arrays: Arrays) -> l
     """Call a kernel while JAX lowers a program for CPUs, as `launch.Launcher` specifies."""
     host, policies = cpu.host_processor(), len(next(iter(arrays.values())))
     # Results are as long as the call says, but for those that take the place of arguments.
-    call = _call(kernel, spec, batch, host.lanes)
+    call = call_of(kernel, spec, batch, host.lanes)
     names = call.arrays[len(arrays) :]
     shapes = [arrays[x].shape if x in arrays else (policies, call.sizes[x]) for x in names]
     like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]

@@ -121,16 +121,31 @@ class Camera:
           Colours from 0 to 255, red, green, blue, or one channel of grey; the first row is the
           upper one.
         """
-        leaves, structure = jax.tree.flatten(self._frame(pose, mocap_positions, appearance))
-        shared = jnp.stack(leaves)
+        shared, structure = self.shared(pose, mocap_positions, appearance)
         # The structure says what differs between episodes.
-        lower = functools.partial(self._make_kernel, structure, len(leaves))
+        lower = functools.partial(self.make_kernel, structure, shared.size)
         kernel = self.kernel_impl.find_kernel(structure, lower)
         values = self._fallback(structure, shared)[0] if kernel is None else kernel.as_map()(shared)
         return values.reshape(self.shape)
 
-    def _make_kernel(self, structure: Hashable, leaves: int) -> Kernel:
-        """Lower an image to a kernel, which takes a frame with a structure and a number of leaves.
+    def shared(
+        self,
+        pose: Pose,
+        mocap_positions: Mapping[str, Float[Array, "3"]],
+        appearance: looks.Appearance = looks.PLAIN,
+    ) -> tuple[Float[Array, " shared"], Hashable]:
+        """Return what all pixels of an image share, and the structure of these numbers.
+
+        Args:
+          pose: the pose of the camera.
+          mocap_positions: positions [m] of mocap bodies, as for `render`.
+          appearance: how the world looks.
+        """
+        leaves, structure = jax.tree.flatten(self._frame(pose, mocap_positions, appearance))
+        return jnp.stack(leaves), structure
+
+    def make_kernel(self, structure: Hashable, leaves: int) -> Kernel:
+        """Lower an image to a kernel, which takes as many numbers of a structure from `shared`.
 
         Raises:
           UnsupportedError: an operation cannot be lowered.

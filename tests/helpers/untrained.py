@@ -1,0 +1,32 @@
+"""Run folders whose policies nobody trained."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks
+from jetbot_mjx.config import Config
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.runs.checkpoint import about_policy
+from jetbot_mjx.runs.checkpoint_store import CheckpointStore
+
+
+def write_untrained_run(folder, config: Config, steps=(0,)):
+    """Write a run folder with a checkpoint for each number of steps; returns the environment."""
+    env = make_env(config)
+    size, actions = env.observation_size, env.action_size
+    networks = make_networks(config.ppo, size, actions)
+    folder.mkdir()
+    with CheckpointStore(folder, keep=len(steps)) as checkpoints:
+        for env_steps in steps:
+            key = jax.random.PRNGKey(env_steps)
+            policy, value = networks.policy_network.init(key), networks.value_network.init(key)
+            params = PolicyParams(init_normalizer(size), policy, value)
+            trees = {
+                "policy": jax.tree.map(
+                    lambda x: np.asarray(x, np.asarray(jnp.asarray(x)).dtype), params
+                )
+            }
+            about = about_policy(config, env) | {"metrics": {"success_rate": 0.5}}
+            checkpoints.save(env_steps, trees, about, 0.5)
+    return env
