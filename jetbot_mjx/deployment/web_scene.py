@@ -18,7 +18,7 @@ class WebScene(NamedTuple):
     """A `WebScene` holds what a page draws."""
 
     bodies: list[int]
-    """The bodies with visible parts, whose poses the page needs."""
+    """The bodies whose poses the page needs: the robot's base, and those with visible parts."""
     about: dict[str, Any]
     """The parts, as JSON values."""
 
@@ -30,7 +30,9 @@ def web_scene(model: mujoco.MjModel, goal: str = "goal") -> WebScene:
       model: the model with its visual elements.
       goal: the body that marks the goal.
     """
-    geoms, bodies, meshes = [], [], []
+    geoms, meshes = [], []
+    # The first joint is that of the robot's base.
+    bodies = [int(model.jnt_bodyid[0])]
     for index in range(model.ngeom):
         geom, rgba = model.geom(index), geom_rgba(model, index)
         kind = mujoco.mjtGeom(model.geom_type[index]).name.removeprefix("mjGEOM_").lower()
