@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack, overload
 
-from jetbot_mjx import evaluation, training, tuning, viewers
+from jetbot_mjx import deployment, evaluation, runs, training, tuning, viewers
 from jetbot_mjx.config import Config, Overrides, load_config
 from jetbot_mjx.devices import require_device
 from jetbot_mjx.errors import InvalidError, UserError, check_count, ran_out
@@ -20,6 +20,7 @@ from jetbot_mjx.runs import default_run_dir, find_run, find_run_config, seed_fol
 from jetbot_mjx.terminal import restart_clock, show_progress
 
 if TYPE_CHECKING:
+    from jetbot_mjx.agents import Policy
     from jetbot_mjx.runs import Which
 
 _FITTING = {
@@ -282,3 +283,24 @@ def _ready(verbose: bool) -> Iterator[None]:
             raise UserError(
                 "the device's memory does not suffice: choose fewer episodes, robots or trials"
             ) from error
+
+
+def load_policy(run_or_checkpoint: str | Path, which: "Which" = "best") -> "Policy":
+    """Read a policy and return it as a function of the observation.
+
+    Args:
+      run_or_checkpoint: a run folder, one checkpoint folder of it, or a folder with the files of
+        `export --format numpy`, which pages write too; such a policy is deterministic.
+      which: the checkpoint of a run folder.
+
+    Returns:
+      `policy(obs, key=None) -> action`, which is deterministic without a key. It raises an
+      `InvalidError` if the observation has another length than that of the training.
+
+    Raises:
+      UserError: there is no usable policy.
+    """
+    folder = Path(run_or_checkpoint)
+    if (folder / "policy.json").is_file() and (folder / "policy.py").is_file():
+        return deployment.read_exported(folder)
+    return runs.load_policy(run_or_checkpoint, which)

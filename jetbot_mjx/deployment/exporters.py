@@ -9,15 +9,19 @@ import base64
 import json
 import re
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, UInt32
 from numpy.typing import ArrayLike, DTypeLike
 
+from jetbot_mjx import runs
+from jetbot_mjx.agents import Observation, Policy
 from jetbot_mjx.deployment.numpy_policy import (
     Encoder,
     Layer,
@@ -25,6 +29,9 @@ from jetbot_mjx.deployment.numpy_policy import (
     OwnController,
     PortablePolicy,
 )
+from jetbot_mjx.envs import NUMBERS, PIXELS
+from jetbot_mjx.errors import InvalidError, UserError
+from jetbot_mjx.runs import JsonObject
 
 if TYPE_CHECKING:
     import onnx
@@ -72,17 +79,70 @@ def _write_numpy(policy: PortablePolicy, _: Act, path: Path) -> None:
     }
     numbers = base64.b64encode(b"".join(np.asarray(a, "<f4").tobytes() for a in arrays)).decode()
     lines = "\n".join(re.findall(f".{{1,{_TEXT_WIDTH}}}", numbers))
+    path.write_text(_numpy_text(about, lines), encoding="utf-8")
+
+
+def _numpy_text(about: JsonObject, numbers: str) -> str:
+    """Return the text of `policy.py` with what it must know, and its numbers in base64."""
     template = resources.files("jetbot_mjx").joinpath("assets/policy.py").read_text("utf-8")
     text = template.replace('"""{}"""', f'"""{json.dumps(about)}"""')
-    text = text.replace('NUMBERS = """\n"""', f'NUMBERS = """\n{lines}\n"""')
-    path.write_text(text, encoding="utf-8")
+    return text.replace('NUMBERS = """\n"""', f'NUMBERS = """\n{numbers}\n"""')
 
 
 def _read_numpy(path: Path) -> Act:
     # An import would leave bytecode in a folder that is copied to a robot.
+    return _module_of(path.read_text("utf-8"), path).act
+
+
+def _module_of(text: str, path: Path) -> types.ModuleType:
     module = types.ModuleType(path.stem)
-    exec(compile(path.read_text("utf-8"), path, "exec"), module.__dict__)
-    return module.act
+    exec(compile(text, path, "exec"), module.__dict__)
+    return module
+
+
+def read_exported(folder: Path) -> Policy:
+    """Return an exported policy as a function of the observation, as `load_policy` does of a run.
+
+    Nothing of the file is executed: its numbers are put into the package's own text.
+
+    Args:
+      folder: a folder with `policy.py`, of an export or downloaded from a page.
+
+    Returns:
+      `policy(obs) -> action`, which is deterministic: an exported policy does not explore.
+
+    Raises:
+      UserError: the file is not such a policy.
+    """
+    path = folder / FORMATS["numpy"].file
+    text = runs.read_text(path)
+    about = re.search(r'json\.loads\("""(.*?)"""\)', text)
+    numbers = re.search(r'^NUMBERS = """\n([A-Za-z0-9+/=\n]*)\n"""', text, re.MULTILINE)
+    try:
+        if about is None or numbers is None:
+            raise ValueError("its numbers are missing")
+        known = json.loads(about[1])
+        act = _module_of(_numpy_text(known, numbers[1]), path).act
+        # What is missing or does not fit shows in the first action.
+        zeros = {"image": np.zeros(known["image"] or 0, np.uint8)}
+        act(*(zeros.get(name, np.zeros(known["shapes"][0])) for name in known["inputs"]))
+    except (ValueError, LookupError, TypeError) as error:
+        raise UserError(f"{path} is not an exported policy: {error}") from None
+
+    def policy(obs: Observation, key: UInt32[Array, "2"] | None = None) -> Array:
+        if key is not None:
+            raise InvalidError("key: an exported policy has no deviations and does not explore")
+        parts = (
+            [obs[name] for name in (PIXELS, NUMBERS) if name in obs]
+            if isinstance(obs, Mapping)
+            else [obs]
+        )
+        try:
+            return jnp.asarray(act(*map(np.asarray, parts))[0])
+        except ValueError as error:
+            raise InvalidError(f"observation: {error}") from None
+
+    return policy
 
 
 def _write_stablehlo(policy: PortablePolicy, as_jax: Act, path: Path) -> None:

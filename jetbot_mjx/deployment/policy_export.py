@@ -67,7 +67,7 @@ def export_policy(
                 importlib.import_module(package)
     # Load the policy.
     checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
-    folder = checkpoint.run_dir / FOLDER if output is None else Path(output)
+    folder = checkpoint.results_dir / FOLDER if output is None else Path(output)
     env = checkpoint.make_env()
     policy, reference = portable_policy(checkpoint, env), as_jax(checkpoint, env)
     with runs.writing_to(folder):

@@ -101,7 +101,7 @@ def _written(prefix: str, robot: "_Robot", others: Mapping[str, Kernel]) -> WebE
     knobs = list(KNOBS)
     try:
         step = _kernel(robot.step, robot.words, robot.action, _floats(len(KNOBS)))
-    except (UnsupportedError, TypeError, ValueError, jax.errors.JAXTypeError):
+    except (UnsupportedError, TypeError):
         # A task may use its settings as plain numbers of Python: then they stay as they are.
         knobs, step = [], _kernel(robot.plain_step, robot.words, robot.action)
     kernels = {"reset": _kernel(robot.reset, _KEY), "step": step, **others}

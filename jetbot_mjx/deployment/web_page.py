@@ -134,6 +134,7 @@ def _about(checkpoint: Checkpoint, env: JetBotEnv) -> dict[str, Any]:
     config, drive = checkpoint.config, env.drive
     task = config.task
     nearest = task.goal_distance_min
+    success = runs.stored_success_rate(checkpoint.run_dir, checkpoint.env_steps)
     return {
         "title": checkpoint.run_dir.name,
         "robot": config.robot.label,
@@ -147,7 +148,7 @@ def _about(checkpoint: Checkpoint, env: JetBotEnv) -> dict[str, Any]:
         "max_yaw_rate": getattr(drive, "max_yaw_rate", None),
         "trained": {
             "steps": checkpoint.env_steps,
-            "success": runs.stored_success_rate(checkpoint.run_dir, checkpoint.env_steps),
+            "success": success if success >= 0 else None,
         },
         "versions": runs.versions(),
     }

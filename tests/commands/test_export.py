@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import jetbot_mjx
 from helpers.bare_python import NUMPY, alone, site_with
 from jetbot_mjx import export
 from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks
@@ -31,7 +32,7 @@ from jetbot_mjx.deployment.numpy_policy import (
 from jetbot_mjx.deployment.policy_spec import policy_spec
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
-from jetbot_mjx.errors import MissingPackageError, UserError
+from jetbot_mjx.errors import InvalidError, MissingPackageError, UserError
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.runs.checkpoint import Checkpoint, about_policy, load_checkpoint
 from jetbot_mjx.runs.run_dir import write_json
@@ -261,6 +262,41 @@ def test_the_numpy_file_needs_numpy_alone(exported, tmp_path):
         f"import runpy; runpy.run_path({str(tmp_path / 'policy.py')!r}, run_name='__main__')",
     )
     assert done.returncode == 1
+
+
+def test_a_program_reads_an_export_as_it_reads_a_run(exported):
+    recording = np.load(exported / "recording.npz")
+    policy = jetbot_mjx.load_policy(exported)
+    np.testing.assert_allclose(policy(recording["obs"]), recording["action"], atol=1e-5)
+    with pytest.raises(InvalidError, match=r"observation: .* not 7 numbers"):
+        policy(np.zeros(3))
+    with pytest.raises(InvalidError, match="does not explore"):
+        policy(recording["obs"][0], jax.random.PRNGKey(0))
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda text: text.replace("NUMBERS = ", "OTHERS = "),
+        lambda text: text.replace('"shapes": [[7]', '"shapes": [[99999999]'),
+        lambda text: text.replace('"activation"', '"activatio"'),
+    ],
+)
+def test_a_file_that_is_no_export_is_told_and_not_executed(spoil, exported, tmp_path):
+    shutil.copy(exported / "policy.json", tmp_path)
+    text = (exported / "policy.py").read_text("utf-8")
+    assert spoil(text) != text
+    (tmp_path / "policy.py").write_text(f"raise SystemExit\n{spoil(text)}", "utf-8")
+    with pytest.raises(UserError, match=r"policy\.py is not an exported policy"):
+        jetbot_mjx.load_policy(tmp_path)
+
+
+def test_a_policy_of_the_package_is_exported_to_the_folder_of_results(
+    shortly, monkeypatch, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    exported = export_policy("pretrained:jetbot_egocentric")
+    assert exported.folder == Path("runs/pretrained/jetbot_egocentric/policy")
 
 
 def test_the_onnx_file_needs_onnxruntime_alone(exported, tmp_path):

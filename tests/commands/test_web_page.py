@@ -317,15 +317,16 @@ def test_a_scene_has_what_can_be_seen():
     model = mujoco.MjModel.from_xml_string(MODEL)
     scene = web_scene(model)
     bodies = [model.body(body).name for body in scene.bodies]
-    assert bodies == ["world", "robot", "goal"]
+    # The robot comes first, whatever stands before it in the model.
+    assert bodies == ["robot", "world", "goal"]
     about = scene.about
     assert (about["bodies"], about["goal"]) == (3, 2)
     shown = [(part["body"], part["type"], part.get("mesh")) for part in about["geoms"]]
     assert shown == [
-        (0, "box", None),
-        (1, "sphere", None),
-        (1, "mesh", 0),
-        (1, "mesh", 0),
+        (1, "box", None),
+        (0, "sphere", None),
+        (0, "mesh", 0),
+        (0, "mesh", 0),
         (2, "ellipsoid", None),
     ]
     assert about["geoms"][0]["pos"] == [1, 0, 0]

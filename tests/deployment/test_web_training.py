@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from brax.training.acme import running_statistics
 
+import jetbot_mjx
 from helpers.source_tree import ROOT
 from helpers.web_pages import shipped
 from jetbot_mjx.agents.fused import arrays, launch
@@ -314,7 +315,9 @@ def test_what_a_page_downloads_is_read_and_acts_as_on_the_page(
 ):
     for name, text in training["files"].items():
         (tmp_path / name).write_text(text, "utf-8")
+    loaded = jetbot_mjx.load_policy(tmp_path)(observations)
     action, wheel_speeds = drive.load_policy(str(tmp_path)).act(observations)
+    np.testing.assert_array_equal(loaded, action)
     np.testing.assert_allclose(action, training["actions"].reshape(action.shape), rtol=0, atol=1e-5)
     targets = jax.vmap(page.env.wheel_targets)(action)
     np.testing.assert_allclose(wheel_speeds, targets, rtol=1e-4, atol=1e-4)

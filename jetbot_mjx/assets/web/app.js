@@ -51,9 +51,8 @@ class Simulation {
   }
 
   setCount(count) {
-    const { knobs = {} } = this;
     this.fleet = this.engine.fleet(count, FLEET_SEED);
-    Object.assign(this.fleet.knobs, knobs);
+    Object.assign(this.fleet.knobs, this.knobs);
     const half = Math.sqrt(count) >> 1;
     this.chosen = half * Math.ceil(Math.sqrt(count)) + half; // in the middle
     this.scene.setFleet(this.fleet);
@@ -258,7 +257,7 @@ class Hand {
   #key(event, down) {
     if (!(event.code in Hand.KEYS) || event.ctrlKey || event.metaKey || event.altKey) return;
     if (!down) return void this.pressed.delete(event.code);
-    if (event.target.closest("input, .stick")) return;
+    if (event.target.closest("input")) return;
     event.preventDefault();
     this.pressed.add(event.code);
     this.take(true);
@@ -607,7 +606,7 @@ class App {
       ["friction", "Friction", 1, 0.05, 2, (x) => `× ${x.toFixed(2)}`],
     ];
     for (const [name, text, initial, low, high, format] of knobs) {
-      const input = make("input", { type: "range", min: low, max: high, step: (high - low) / 100, value: initial });
+      const input = make("input", { type: "range", min: low, max: high, step: "any", value: initial });
       const output = make("output", {}, format(initial));
       input.addEventListener("input", () => {
         this.simulation.setKnob(name, Number(input.value));

@@ -298,22 +298,22 @@ const DECAL_SHADER = [`${POSE}
 in vec4 box; // middle x, y and half sizes x, y in the body's frame [m]
 in vec4 shape; // signs of the corner, radius of the box's corners, and softness or width of a ring [m]
 in float row;
-out vec2 at, edge, half_;
+out vec2 at, edge, halves;
 void main() {
   vec4 place = rows[int(row)], q = rows[int(row) + 1];
   vec2 ahead = vec2(1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z + q.x * q.w));
   ahead = length(ahead) > 1e-3 ? normalize(ahead) : vec2(1.0, 0.0);
   at = shape.xy * (box.zw + shape.z + shape.w);
   edge = shape.zw;
-  half_ = box.zw;
+  halves = box.zw;
   vec2 p = (box.xy + at) * place.w;
   gl_Position = view * vec4(place.xy + ahead * p.x + vec2(-ahead.y, ahead.x) * p.y, 0.0, 1.0);
 }`, `
-in vec2 at, edge, half_;
+in vec2 at, edge, halves;
 uniform vec4 tint;
 uniform float ring; // whether it is a ring
 void main() {
-  float d = length(max(abs(at) - half_, 0.0)) - edge.x, fill = 1.0 - smoothstep(-edge.y, edge.y, d);
+  float d = length(max(abs(at) - halves, 0.0)) - edge.x, fill = 1.0 - smoothstep(-edge.y, edge.y, d);
   float line = 1.0 - smoothstep(0.35 * edge.y, edge.y, abs(d));
   pixel = vec4(tint.rgb, tint.a * mix(fill * fill, line, ring));
 }`];
