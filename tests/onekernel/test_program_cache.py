@@ -343,7 +343,7 @@ def test_the_source_is_all_python_and_all_models():
     files = [path for root in roots for path in root.rglob("*") if path.is_file()]
     # Finished runs, and what reports tell beside them, decide nothing.
     suffixes = {path.suffix for path in files if PRETRAINED not in path.parents}
-    others = {".html", ".json", ".md", ".mplstyle", ".pyc", ".typed", ".yaml", ""}
+    others = {".gz", ".html", ".js", ".json", ".md", ".mplstyle", ".pyc", ".typed", ".yaml", ""}
     assert suffixes - others <= program_key.SOURCES
 
 

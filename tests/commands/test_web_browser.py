@@ -1,0 +1,104 @@
+"""A page in a browser: it draws, drives, learns and takes what a visitor does, without an error."""
+
+import io
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from helpers.browser import tab
+from jetbot_mjx.deployment import write_web_page
+
+PAGE = "pretrained:jetbot_egocentric"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "page.html"
+    write_web_page(PAGE, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with tab() as one:
+        yield one
+
+
+@pytest.fixture
+def open_page(browser, page):
+    def open_at(width, height):
+        browser.errors.clear()
+        browser.open(page, width, height)
+        browser.wait_for("Boolean(window.jetbot && window.jetbot.ready)")
+        return browser
+
+    yield open_at
+    assert browser.errors == []
+
+
+def colours(picture):
+    return np.unique(
+        np.asarray(PIL.Image.open(io.BytesIO(picture)).convert("RGB")).reshape(-1, 3), axis=0
+    )
+
+
+@pytest.mark.parametrize(("width", "height"), [(1400, 900), (400, 800)])
+def test_robots_drive_and_are_drawn(width, height, open_page):
+    tab = open_page(width, height)
+    tab.wait_for("jetbot.fleet.successes > 3")
+    # Every goal is reached in time.
+    assert tab.run("jetbot.fleet.successes === jetbot.fleet.episodes")
+    reds, greens, _ = colours(tab.picture()).T.astype(int)
+    # Among the colours are the red of the cubes and the green of those that were reached.
+    assert (reds - greens > 100).any()
+    assert tab.run("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_a_thousand_robots_drive(open_page):
+    tab = open_page(1280, 720)
+    tab.run(
+        "[...document.querySelectorAll('label')].find((x) => /1,024/.test(x.innerText)).click()"
+    )
+    tab.wait_for("jetbot.fleet.count === 1024 && jetbot.fleet.time > 0.5")
+    positions = tab.run("Array.from(jetbot.fleet.goals())")
+    assert len(positions) == 3 * 1024
+    assert np.isfinite(positions).all()
+
+
+def test_a_policy_learns_in_a_worker_and_its_files_are_offered(open_page):
+    tab = open_page(1280, 720)
+    tab.run(
+        "[...document.querySelectorAll('button')].find((x) => x.textContent === 'Start').click()"
+    )
+    tab.wait_for(
+        "jetbot.learner && jetbot.learner.latest && jetbot.learner.latest.steps > 16000", 120
+    )
+    first, steps = tab.run("[jetbot.learner.latest.success, jetbot.learner.latest.steps]")
+    assert 0 <= first <= 1
+    assert steps % 16_384 == 0
+    files = tab.run("jetbot.learner.download()")
+    assert set(files) == {"policy.py", "policy.json"}
+    tab.run("jetbot.learner.stop()")
+
+
+def test_a_goal_goes_where_it_is_put_and_a_robot_is_driven_by_hand(open_page):
+    tab = open_page(1280, 720)
+    tab.run("jetbot.fleet.setGoal(0, 1.5, -0.5)")
+    goal = tab.run("Array.from(jetbot.fleet.goals().slice(0, 2))")
+    np.testing.assert_allclose(goal, [1.5, -0.5], atol=1e-6)
+    tab.run("jetbot.fleet.drive(0, Float32Array.of(-1, 1))")
+    tab.wait_for("Math.abs(jetbot.fleet.action(0)[1] - 1) < 1e-6")
+
+
+def test_a_browser_without_webgl_is_told_in_one_line(browser, page, tmp_path):
+    # Without WebGL 2, a canvas has no such context.
+    spoilt = page.read_text("utf-8").replace('getContext("webgl2"', 'getContext("webgl9"')
+    assert spoilt != page.read_text("utf-8")
+    path = tmp_path / "spoilt.html"
+    # The changed script has another hash: leave the policy out.
+    path.write_text(spoilt.replace("Content-Security-Policy", "X-Nothing"), "utf-8")
+    browser.errors.clear()
+    browser.open(path, 1280, 720)
+    browser.wait_for("document.body.innerText.includes('WebGL')")
+    assert browser.errors == []
