@@ -126,6 +126,9 @@ class _Robot:
         self.env, self._ranges = env, ranges
         self._wrapped = self._wrap(env)
         self._like = jax.eval_shape(lambda key: pack(self._wrapped.reset(key)), _KEY)
+        # Words hold numbers of 32 bits; other arrays must be empty.
+        if lost := [x.dtype for x in self._like.others if x.size]:
+            raise UnsupportedError(f"a state with numbers of {lost[0]}: make them int32 or float32")
         self.words: jax.ShapeDtypeStruct = self._like.words
         self.action = _floats(env.action_size)
 

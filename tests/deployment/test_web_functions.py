@@ -111,6 +111,27 @@ class CallingTask(GoalTask):
 """
 
 
+REMEMBERING = """
+import jax.numpy as jnp
+from typing import NamedTuple
+from jetbot_mjx.envs import GoalTask
+
+class Place(NamedTuple):
+    position: jnp.ndarray
+    seen: jnp.ndarray
+
+class RememberingTask(GoalTask):
+    def sample(self, key):
+        return Place(super().sample(key), jnp.zeros(3, bool))
+
+    def goal_position(self, goal):
+        return goal.position
+
+    def move_goal(self, goal, position_w):
+        return goal._replace(position=position_w)
+"""
+
+
 def own_task(folder, source, name):
     """The configuration of a task that is written beside it."""
     (folder / f"{name.lower()}_of_mine.py").write_text(source)
@@ -134,11 +155,18 @@ def test_a_task_that_reads_its_settings_as_plain_numbers_has_no_knobs(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_task_that_is_no_kernel_is_an_error_of_one_line(tmp_path):
-    write_untrained_run(tmp_path / "run", own_task(tmp_path, CALLING, "CallingTask"))
+@pytest.mark.parametrize(
+    ("source", "name", "reason"),
+    [
+        (CALLING, "CallingTask", "pure_callback"),
+        (REMEMBERING, "RememberingTask", "numbers of bool: make them int32 or float32"),
+    ],
+)
+def test_a_task_that_is_no_kernel_is_an_error_of_one_line(source, name, reason, tmp_path):
+    write_untrained_run(tmp_path / "run", own_task(tmp_path, source, name))
     with pytest.raises(UserError) as caught:
         page_data(load_checkpoint(tmp_path / "run"))
     message = str(caught.value)
     assert message.startswith("no page of run: ")
-    assert "pure_callback" in message
+    assert reason in message
     assert len(message.splitlines()) == 1
