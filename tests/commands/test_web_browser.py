@@ -100,5 +100,5 @@ def test_a_browser_without_webgl_is_told_in_one_line(browser, page, tmp_path):
     path.write_text(spoilt.replace("Content-Security-Policy", "X-Nothing"), "utf-8")
     browser.errors.clear()
     browser.open(path, 1280, 720)
-    browser.wait_for("document.body.innerText.includes('WebGL')")
+    browser.wait_for("Boolean(document.body && document.body.innerText.includes('WebGL'))")
     assert browser.errors == []
