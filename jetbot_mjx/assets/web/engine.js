@@ -375,7 +375,7 @@ class Fleet {
     const { robots, count, done, success } = this, actions = robots.actions.view;
     if (this.scripted) robots.call("script", robots.words.address, robots.actions.address, count);
     else if (this.policy) this.policy.act(this.observed, this.eyes, actions, this.actionSize);
-    for (const [robot, action] of this.manual) actions.set(action.subarray(0, this.actionSize), robot * this.actionSize);
+    for (const [robot, action] of this.manual) actions.set(action.slice(0, this.actionSize), robot * this.actionSize);
     robots.step();
     for (let robot = 0; robot < count; robot++) {
       done[robot] = robots.number("done", robot) > 0 ? 1 : 0;
