@@ -98,7 +98,7 @@ def _written(prefix: str, robot: "_Robot", others: Mapping[str, Kernel]) -> WebE
       robot: the robot.
       others: the kernels of the other functions, by name.
     """
-    knobs = list(KNOBS)
+    knobs = robot.knobs
     try:
         step = _kernel(robot.step, robot.words, robot.action, _floats(len(KNOBS)))
     except (UnsupportedError, TypeError):
@@ -131,6 +131,13 @@ class _Robot:
             raise UnsupportedError(f"a state with numbers of {lost[0]}: make them int32 or float32")
         self.words: jax.ShapeDtypeStruct = self._like.words
         self.action = _floats(env.action_size)
+        # What is drawn is not changed, nor the actions of a drive that is a function of its own.
+        changeable = {
+            "success_radius": True,
+            "speed": hasattr(env.drive, "max_speed"),
+            "friction": "friction" not in ranges.drawn,
+        }
+        self.knobs = [name for name in KNOBS if changeable[name]]
 
     def _wrap(self, env: JetBotEnv, friction: Array | float = 1.0) -> envs.NewEpisodeWrapper:
         """Wrap an environment, whose friction is changed by a factor."""
@@ -180,9 +187,11 @@ class _Robot:
         radius, speed, friction = knobs
         config = self.env.config.task.model_copy(update={"success_radius": radius})
         env = self.env.with_task(type(self.env.task)(config))
-        wrapped = self._wrap(env, 1.0 if "friction" in self._ranges.drawn else friction)
+        wrapped = self._wrap(env, friction if "friction" in self.knobs else 1.0)
         # A share of the speed range is a part of the first action's range.
-        slower = action.at[0].set((jnp.clip(action[0], -1.0, 1.0) + 1.0) * speed - 1.0)
+        slower = action
+        if "speed" in self.knobs:
+            slower = action.at[0].set((jnp.clip(action[0], -1.0, 1.0) + 1.0) * speed - 1.0)
         return pack(wrapped.step(self.state(words), slower)).words
 
     def moved(

@@ -75,6 +75,8 @@ def write_web_page(
     path = checkpoint.results_dir / FILE if output is None else Path(output)
     if path.is_dir():
         raise UserError(f"{path} is a folder: name a file with --output, such as {path / FILE}")
+    if path.exists() and not path.is_file():
+        raise UserError(f"{path} is no file: name a file with --output, such as {FILE}")
     runs.check_writable(path.parent)
     with stage("compiling robot, task and policies for web pages"):
         data = page_data(checkpoint)
@@ -144,7 +146,7 @@ def _about(checkpoint: Checkpoint, env: JetBotEnv) -> dict[str, Any]:
         "success_radius": task.success_radius,
         "goal_range": [nearest, nearest + task.goal_distance_span],
         "observation": _observed(env),
-        "max_speed": getattr(drive, "max_speed", 1.0),
+        "max_speed": getattr(drive, "max_speed", None),
         "max_yaw_rate": getattr(drive, "max_yaw_rate", None),
         "trained": {
             "steps": checkpoint.env_steps,

@@ -82,6 +82,15 @@ def test_a_policy_learns_in_a_worker_and_its_files_are_offered(open_page):
     tab.run("jetbot.learner.stop()")
 
 
+def test_a_training_ends_with_its_last_step(open_page):
+    tab = open_page(1280, 720)
+    tab.run("jetbot.app.trainPanel.data.meta.learner.steps = 4096")
+    tab.run("document.getElementById('start').click()")
+    tab.wait_for("document.getElementById('training').textContent === 'finished'", 120)
+    assert tab.run("jetbot.app.trainPanel.current.latest.steps") == 4096
+    assert tab.run("document.getElementById('start').textContent") == "Start anew"
+
+
 def test_a_goal_goes_where_it_is_put_and_a_robot_is_driven_by_hand(open_page):
     tab = open_page(1280, 720)
     tab.run("jetbot.fleet.setGoal(0, 1.5, -0.5)")

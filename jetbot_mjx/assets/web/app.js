@@ -70,6 +70,11 @@ class Simulation {
     this.resetCounters();
   }
 
+  /** Takes a newer policy of the training; the goals that the visitor reached still count. */
+  refresh() {
+    this.fleet.drivenBy(this.learned);
+  }
+
   setKnob(name, value) {
     this.knobs[name] = value;
     this.fleet.knobs[name] = value;
@@ -255,8 +260,9 @@ class Hand {
   }
 
   #key(event, down) {
-    if (!(event.code in Hand.KEYS) || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!(event.code in Hand.KEYS)) return;
     if (!down) return void this.pressed.delete(event.code);
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.target.closest("input")) return;
     event.preventDefault();
     this.pressed.add(event.code);
@@ -290,7 +296,7 @@ class Hand {
 
   /** Moves the action towards what is pressed. An action of -1, 0 stands still. */
   update(seconds) {
-    if (!this.simulation.byHand) return;
+    if (!this.simulation.byHand) return void Object.assign(this, { speed: 0, turn: 0 });
     let speed = 0, turn = 0;
     if (this.stick) [speed, turn] = this.stick;
     for (const code of this.pressed) {
@@ -358,10 +364,11 @@ class RobotPanel {
     }
     const { max_speed: speed, max_yaw_rate: yaw } = this.meta;
     const units = [`${((Math.max(-1, action[0]) + 1) / 2 * speed).toFixed(2)} m/s`, yaw === null ? "" : `${RobotPanel.#signed(action[1] * yaw, 2)} rad/s`];
+    const shown = speed === null ? Array.from(action, (x) => RobotPanel.#signed(x, 2)) : units;
     for (const [i, { fill, output }] of this.meters.entries()) {
       fill.style.left = `${50 + 50 * Math.min(0, action[i])}%`;
       fill.style.width = `${50 * Math.abs(action[i])}%`;
-      write(output, units[i]);
+      write(output, shown[i]);
     }
     if (this.context) this.#drawImage(fleet.image(chosen));
   }
@@ -458,7 +465,7 @@ class TrainPanel {
     this.curve = new Curve(byId("curve"));
     byId("train").addEventListener("toggle", () => this.curve.draw());
     byId("start").addEventListener("click", () => this.#toggle());
-    byId("stop").addEventListener("click", () => this.#stop());
+    byId("stop").addEventListener("click", () => this.#stop("The training was stopped."));
     byId("download").addEventListener("click", () => this.#download());
   }
 
@@ -478,7 +485,9 @@ class TrainPanel {
     this.learner.onerror = (message) => this.#fail(message);
     this.curve.points = [];
     byId("curve").removeAttribute("hidden");
+    this.curve.draw();
     this.reachedAim = "";
+    write(byId("aim"), "");
     this.takeKnobs();
     announce(`Training from scratch with seed ${seed} has begun.`);
   }
@@ -489,7 +498,7 @@ class TrainPanel {
   }
 
   #progress(progress) {
-    const { steps, success, interval, seconds, policy } = progress;
+    const { steps, success, interval, seconds, policy, finished } = progress;
     this.curve.points.push({ steps, success, low: interval[0], high: interval[1] });
     this.curve.draw();
     if (success >= AIM && !this.reachedAim) {
@@ -498,22 +507,24 @@ class TrainPanel {
     }
     this.simulation.learned = policy;
     this.onpolicy();
-    this.#show();
+    if (finished) this.#stop("The training has made all of its steps.");
+    else this.#show();
   }
 
   #fail(message) {
-    this.#stop();
+    if (!this.learner) return;
+    this.#stop("The training has failed.");
     write(byId("progress"), `The training ended with an error: ${message}`);
   }
 
-  /** Ends the training, whose policy stays. */
-  #stop() {
+  /** Ends the training, whose policy stays, and says why. */
+  #stop(reason) {
     this.learner.stop();
     this.ended = this.learner;
     this.learner = null;
     this.running = false;
     this.#show();
-    announce("The training was stopped.");
+    announce(reason);
   }
 
   #show() {
@@ -523,8 +534,8 @@ class TrainPanel {
     byId("stop").disabled = !learner;
     byId("download").disabled = !latest;
     byId("seed").disabled = Boolean(learner);
-    write(byId("training"), running ? "learning" : learner ? "paused" : "");
-    if (!latest) return write(byId("progress"), "Loading …");
+    write(byId("training"), running ? "learning" : learner ? "paused" : latest?.finished ? "finished" : "");
+    if (!latest) return write(byId("progress"), learner ? "Loading …" : "Stopped before the first result.");
     const { steps, seconds, success } = latest;
     write(byId("progress"), `${percent(success)} · ${shortCount(steps)} steps · ${seconds.toFixed(1)} s`);
     write(byId("aim"), this.reachedAim);
@@ -588,7 +599,10 @@ class App {
   #makeChoices({ policies }) {
     const drivers = policies.map(({ name, env_steps: steps }, index) =>
       [`policy ${index}`, name[0].toUpperCase() + name.slice(1), `${shortCount(steps)} steps`]);
-    drivers.push(["scripted", "Scripted", "no network"], ["learning", "Learning", "in this page"]);
+    // A drive that is a function of its own has no speed and no yaw rate that others could command.
+    if (this.meta.max_speed !== null) drivers.push(["scripted", "Scripted", "no network"]);
+    byId("manual").hidden = this.meta.max_speed === null;
+    drivers.push(["learning", "Learning", "in this page"]);
     this.#choices(byId("drivers"), "driver", drivers, `policy ${policies.length - 1}`, (name) => this.setDriver(name));
     this.learning = document.querySelector("input[value=learning]");
     this.learning.disabled = true;
@@ -601,11 +615,12 @@ class App {
     const { success_radius: radius, max_speed: speed, robot_functions: functions } = this.meta;
     byId("knobs").hidden = functions.knobs.length === 0;
     const knobs = [
-      ["successRadius", "Success radius", radius, 0.2 * radius, 3 * radius, (x) => `${x.toFixed(2)} m`],
-      ["maxSpeed", "Speed limit", speed, 0.1 * speed, speed, (x) => `${x.toFixed(2)} m/s`],
-      ["friction", "Friction", 1, 0.05, 2, (x) => `× ${x.toFixed(2)}`],
+      ["successRadius", "success_radius", "Success radius", radius, 0.2 * radius, 3 * radius, (x) => `${x.toFixed(2)} m`],
+      ["maxSpeed", "speed", "Speed limit", speed, 0.1 * speed, speed, (x) => `${x.toFixed(2)} m/s`],
+      ["friction", "friction", "Friction", 1, 0.05, 2, (x) => `× ${x.toFixed(2)}`],
     ];
-    for (const [name, text, initial, low, high, format] of knobs) {
+    for (const [name, knob, text, initial, low, high, format] of knobs) {
+      if (!functions.knobs.includes(knob)) continue;
       const input = make("input", { type: "range", min: low, max: high, step: "any", value: initial });
       const output = make("output", {}, format(initial));
       input.addEventListener("input", () => {
@@ -667,7 +682,7 @@ class App {
   }
 
   setManual(byHand) {
-    if (byHand === this.simulation.byHand) return;
+    if (byHand === this.simulation.byHand || this.meta.max_speed === null) return;
     this.simulation.takeWheel(byHand);
     byId("manual").setAttribute("aria-pressed", byHand);
     byId("stick").hidden = !byHand;
@@ -709,7 +724,9 @@ class App {
     const first = this.learning.disabled;
     this.learning.disabled = false;
     if (first || this.trainPanel.curve.points.length === 1) this.learning.checked = true;
-    if (this.learning.checked) this.simulation.setDriver({ kind: "learning" });
+    if (!this.learning.checked) return;
+    if (this.simulation.driver.kind === "learning") this.simulation.refresh();
+    else this.simulation.setDriver({ kind: "learning" });
   }
 
   /** Keeps the view in the middle of what the panel leaves free. */

@@ -237,20 +237,25 @@ class TrainingWorker {
     this.running = running;
     if (!running || this.busy) return;
     this.busy = true;
-    while (this.running) {
+    while (this.running && !this.finished) {
       const begin = performance.now();
       this.trainer.step();
       this.seconds += (performance.now() - begin) / 1000;
-      if (++this.calls % EXAMINED_EVERY === 0) this.report();
+      if (++this.calls % EXAMINED_EVERY === 0 || this.finished) this.report();
       await new Promise((resolve) => setTimeout(resolve));
     }
     this.busy = false;
   }
 
+  /** Whether the training has made as many steps as its settings say. */
+  get finished() {
+    return this.trainer.steps >= this.trainer.about.steps;
+  }
+
   report() {
-    const { trainer, examination, seconds } = this, policy = trainer.policy();
+    const { trainer, examination, seconds, finished } = this, policy = trainer.policy();
     const reached = examination.reached(policy);
-    this.send({ steps: trainer.steps, seconds, reached, goals: EXAMINED_GOALS, policy });
+    this.send({ steps: trainer.steps, seconds, reached, goals: EXAMINED_GOALS, policy, finished });
   }
 }
 
