@@ -45,8 +45,8 @@ class WebPage(NamedTuple):
     path: Path
     size: int
     """Bytes of the file."""
-    policies: Sequence[str]
-    """Names of the policies that the page has."""
+    drivers: Sequence[str]
+    """Who can drive on the page."""
     no_learner: str | None
     """Why the page cannot train; None: it can."""
 
@@ -84,8 +84,10 @@ def write_web_page(
     with runs.writing_to(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         runs.write_text(path, text)
-    names = [policy["name"] for policy in data["policies"]]
-    return WebPage(path, len(text.encode()), names, data["meta"]["no_learner"])
+    drivers = [policy["name"] for policy in data["policies"]]
+    if data["meta"]["max_speed"] is not None:
+        drivers += ["scripted", "you"]
+    return WebPage(path, len(text.encode()), drivers, data["meta"]["no_learner"])
 
 
 def summarize_web_page(page: WebPage) -> str:
@@ -94,7 +96,7 @@ def summarize_web_page(page: WebPage) -> str:
     reason = "" if page.no_learner is None else "no training in the page: "
     return (
         f"{runs.shortened(page.path)}, {page.size / 1e6:.2f} MB, opens in any browser\n"
-        f"  drivers: {', '.join(page.policies)}, scripted, you; {reason}{trains}"
+        f"  drivers: {', '.join(page.drivers)}; {reason}{trains}"
     )
 
 
