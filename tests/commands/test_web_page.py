@@ -67,7 +67,7 @@ class Parts(HTMLParser):
 
 def data_of(title="run", **others):
     """What a page is made of, with no robot."""
-    meta = {"title": title, "no_learner": None, **others}
+    meta = {"title": title, "no_learner": None, "max_speed": 1.0, **others}
     return {"meta": meta, "module": "", "policies": [{"name": "final"}]}
 
 
@@ -182,7 +182,9 @@ def test_a_page_of_a_shipped_policy_is_written_into_the_present_folder(quick, he
 
 
 def test_why_a_page_cannot_train_is_told(here, capfd, monkeypatch):
-    data = data_of() | {"meta": {"title": "run", "no_learner": "it takes no images"}}
+    data = data_of() | {
+        "meta": {"title": "run", "max_speed": 1.0, "no_learner": "it takes no images"}
+    }
     monkeypatch.setattr(web_page, "page_data", lambda _: data)
     assert export.main(["pretrained:jetbot_camera", "--format", "web"]) == 0
     assert "no training in the page: it takes no images" in capfd.readouterr().out
