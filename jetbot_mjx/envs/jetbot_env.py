@@ -22,6 +22,7 @@ from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, numbers_of, observation_shapes, see
 from jetbot_mjx.envs.drive import Drive, jetbot_drive
+from jetbot_mjx.envs.kernel_impl import KernelImpl
 from jetbot_mjx.envs.mjcf_robot import RobotFileError
 from jetbot_mjx.envs.mjcf_wheels import find_drive
 from jetbot_mjx.envs.physics import Physics
@@ -32,6 +33,7 @@ from jetbot_mjx.envs.task import (
     AdvancesGoal,
     Goal,
     GoalTask,
+    Layout,
     RobotState,
     Task,
     TaskClass,
@@ -385,6 +387,23 @@ class JetBotEnv(Env):
         """Length of the action: drive and turn, unless the robot's drive is a function."""
         return self.drive.action_size
 
+    has_success = True
+
+    @property
+    def layout(self) -> Layout:
+        """The numbers of the observation."""
+        return self.task.layout
+
+    @property
+    def kernel_impl(self) -> KernelImpl:
+        """What computes a step: one kernel, or XLA."""
+        return self.physics.kernel_impl
+
+    @property
+    def may_be_kernel(self) -> bool:
+        """Whether physics may be a kernel, and so the whole step."""
+        return self.physics.may_be_kernel
+
     @property
     def backend(self) -> str:
         """Name of the physics back end, for Brax."""
@@ -426,13 +445,13 @@ def _check_one(name: str, array: object, shape: tuple[int, ...], method: str) ->
     raise InvalidError(f"{name}: expected an array of shape {list(shape)}; got {got}")
 
 
-def make_env(
+def make_jetbot_env(
     config: str | Path | Config,
     overrides: Overrides = (),
     *,
     task_class: TaskClass | None = None,
 ) -> JetBotEnv:
-    """Build the environment that a configuration describes.
+    """Build the environment of a robot and its task, of a configuration without `environment`.
 
     Args:
       config: the configuration, its name or its file, as for `load_config`; the sections robot,

@@ -71,6 +71,20 @@ def describe_error(error: Exception, who: str, folders: Sequence[Path]) -> str:
     return " ".join(f"{who} raises {kind}{': ' * bool(what)}{what}{where}".split())
 
 
+def changed_leaf(first: object, last: object) -> str:
+    """Return the first leaf whose shape or dtype differs between two states; empty if none."""
+    sides = [dict(jax.tree_util.tree_leaves_with_path(state)) for state in (first, last)]
+    for path in (*sides[0], *sides[1]):
+        one, other = (_type(side.get(path)) for side in sides)
+        if one != other:
+            return jax.tree_util.keystr(path).lstrip(".")
+    return ""
+
+
+def _type(leaf: jax.ShapeDtypeStruct | None) -> object:
+    return None if leaf is None else (leaf.shape, leaf.dtype, leaf.weak_type)
+
+
 # Inputs and results of the methods.
 
 
