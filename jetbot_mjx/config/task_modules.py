@@ -28,7 +28,7 @@ def class_name(value: object) -> object:
     module, separator, name = value.partition(":")
     if module.endswith(".py"):
         module = ".".join(Path(module.removesuffix(".py")).parts)
-    if separator and all(part.isidentifier() for part in (*module.split("."), name)):
+    if separator and all(part.isidentifier() for part in (*module.split("."), *name.split("."))):
         return f"{module}:{name}"
     # Python itself separates a class from its module by a dot.
     likely = ":".join(value.rpartition(".")[::2])

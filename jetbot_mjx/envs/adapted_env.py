@@ -179,6 +179,11 @@ class AdaptedEnv(Env):
             info={**state.info, "terminated": shown.terminated},
         )
 
+    @property
+    def traced(self) -> tuple[ClosedJaxpr, ClosedJaxpr]:
+        """Return reset and step as they were traced."""
+        return self._reset_traced.jaxpr, self._step_traced.jaxpr
+
     def _divided(self, leaves: Sequence[Array]) -> tuple[dict[str, Array], Outcome]:
         """Return what is kept, by name, and the rest of an outcome."""
         count = len(self._names)

@@ -23,12 +23,12 @@ from jetbot_mjx.config import (
 )
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.actuators import ActuatorState, initial_actuator_state, step_actuators
+from jetbot_mjx.envs.adapted_env import AdaptedEnv
 from jetbot_mjx.envs.camera.scene import GOAL
 from jetbot_mjx.envs.camera.surroundings import draw_surroundings
 from jetbot_mjx.envs.camera.timing import CameraState, initial_camera_state, step_camera
 from jetbot_mjx.envs.camera.wrapper import seen_pose
 from jetbot_mjx.envs.drive import OwnDrive
-from jetbot_mjx.envs.adapted_env import AdaptedEnv
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.envs.robot_params import vary_model, vary_own_model

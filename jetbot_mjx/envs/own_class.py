@@ -50,9 +50,11 @@ def import_class(key: str, name: str) -> Any:
             f"{key} = {name!r}: {error.filename}, line {error.lineno}, is not valid Python:"
             f" {error.msg}"
         ) from None
-    found = getattr(module, class_name, None)
-    if found is None:
-        close = difflib.get_close_matches(class_name, dir(module), n=1)
-        hint = f": did you mean {close[0]!r}?" if close else ""
-        raise InvalidError(f"{key} = {name!r}: {module_name} has no {class_name!r}{hint}")
+    found, owner = module, module_name
+    for part in class_name.split("."):
+        if not hasattr(found, part):
+            close = difflib.get_close_matches(part, dir(found), n=1)
+            hint = f": did you mean {close[0]!r}?" if close else ""
+            raise InvalidError(f"{key} = {name!r}: {owner} has no {part!r}{hint}")
+        found, owner = getattr(found, part), part
     return found

@@ -146,6 +146,7 @@ def run(
         written; the task cannot be built; the environments cannot be divided among the devices,
         the CPU is divided otherwise, or the devices have too little memory.
     """
+    keep = programs is not None
     if programs is None:
         programs = envs.open_program_cache(config, keep=False)
     if programs.loads:
@@ -160,7 +161,7 @@ def run(
     runs.check_tracking(config)
     # Build every object once, and train.
     with collect() as fallbacks:
-        training = _compose(config, run_dir, programs, fallbacks, verbose=verbose)
+        training = _compose(config, run_dir, programs, fallbacks, keep=keep, verbose=verbose)
         try:
             if config.trainer == "brax":
                 result = _train_with_brax(training)
@@ -184,6 +185,7 @@ def _compose(
     programs: ProgramCache,
     fallbacks: Sequence[Fallback],
     *,
+    keep: bool,
     verbose: bool,
 ) -> Training:
     """Build every object of a training once."""
@@ -194,6 +196,9 @@ def _compose(
         _check_targets(config, setup.env)
     elif not envs.is_built_in(config.task.name):
         envs.require_trainable(setup.env.task, config)
+    if keep and not envs.is_built_in(config.code):
+        # Only now it is known what the programs depend on.
+        setup.programs = envs.open_program_cache(config, own=envs.own_fingerprint(setup.env))
     ppo = ppo_trainer.build_ppo(setup)
     # Another run's policy is loaded only for a run without checkpoints of its own.
     warm_start = None

@@ -63,7 +63,7 @@ def describe_error(error: Exception, who: str, folders: Sequence[Path]) -> str:
     places = [
         (file, line)
         for file, line in places
-        if (file.parent in folders if folders else file.parent != _PACKAGE)
+        if (file.parent in folders if folders else _PACKAGE not in file.parents)
         and "site-packages" not in file.parts
         and not str(file).startswith("<")
     ]
