@@ -76,6 +76,10 @@ def load_model() -> mujoco.MjModel:
             "half_cheetah.py uses a model of gymnasium: pip install gymnasium"
         )
     path = Path(found.origin).parent / "envs/mujoco/assets/half_cheetah.xml"
-    model = mujoco.MjModel.from_xml_path(str(path))
+    # MuJoCo warns of this attribute; it does what the two lines after it do.
+    mjcf = path.read_text("utf-8").replace('settotalmass="14"', "")
+    model = mujoco.MjModel.from_xml_string(mjcf)
+    mujoco.mj_setTotalmass(model, 14)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 20, 4, 1e-6
     return model
