@@ -69,13 +69,13 @@ class Cartpole:
         # Times are sums of float32: compare them within half a step.
         is_over = physics.time > self.duration - self.dt / 2
         success = is_over & (fallen_at < self.duration / 2 + self.dt / 2)
-        metrics = {"upright": upright, "success": success}
+        metrics = {"upright": jnp.float32(upright), "success": jnp.float32(success)}
         reward = 0.5 * (1 + cosine) * (1 - 0.1 * x**2) / (1 + 0.05 * physics.qvel[1] ** 2)
         return state.replace(
             pipeline_state=physics,
             obs=observe(physics),
             reward=reward - 0.01 * action[0] ** 2,
-            metrics={name: x.astype(jnp.float32) for name, x in metrics.items()},
+            metrics=state.metrics | metrics,
             info=state.info | {"fallen_at": fallen_at},
         )
 

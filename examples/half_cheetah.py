@@ -59,7 +59,7 @@ class HalfCheetah:
             pipeline_state=physics,
             obs=observe(physics),
             reward=jnp.sum(terms),
-            metrics=dict(zip(TERMS, terms, strict=True)),
+            metrics=state.metrics | dict(zip(TERMS, terms, strict=True)),
         )
 
 

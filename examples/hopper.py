@@ -59,7 +59,7 @@ class Hopper:
             obs=observe(physics),
             reward=jnp.sum(terms),
             done=1.0 - healthy,
-            metrics=dict(zip(TERMS, terms, strict=True)),
+            metrics=state.metrics | dict(zip(TERMS, terms, strict=True)),
         )
 
 

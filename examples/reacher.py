@@ -57,7 +57,7 @@ class Reacher:
             pipeline_state=physics,
             obs=observe(physics),
             reward=jnp.sum(terms),
-            metrics=dict(zip(TERMS, terms, strict=True)),
+            metrics=state.metrics | dict(zip(TERMS, terms, strict=True)),
         )
 
 
