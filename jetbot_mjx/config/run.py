@@ -121,6 +121,11 @@ class Config(Section):
     @model_validator(mode="after")
     def _environment_is_alone(self) -> Self:
         if self.environment is None:
+            if self.ppo.network.distribution_type == "categorical":
+                raise ValueError(
+                    "ppo.network.distribution_type = 'categorical' is for an environment whose"
+                    " actions are choices, and those of the robot are numbers: choose tanh_normal"
+                )
             if self.environment_options:
                 raise ValueError(
                     f"environment_options = {shown(self.environment_options)} are the arguments of"

@@ -73,6 +73,16 @@ class AdaptedEnv(Env):
         self.source: Any = self._told(found.__name__, lambda: found(**options))
         """The environment itself."""
         one = self._told("it", lambda: as_foreign(self.source))
+        kind = config.ppo.network.distribution_type
+        if one.is_discrete != (kind == "categorical"):
+            raise InvalidError(
+                f"ppo.network.distribution_type = {kind!r} does not fit environment = {name!r}: "
+                + (
+                    f"its actions are {one.action_size} choices: set categorical"
+                    if one.is_discrete
+                    else "its actions are numbers: set tanh_normal"
+                )
+            )
         self._trace(one)
 
     def __repr__(self) -> str:
@@ -234,7 +244,7 @@ class AdaptedEnv(Env):
     def mj_model(self) -> mujoco.MjModel | None:
         """MuJoCo's model, for pictures; None: the environment has none, or keeps no `qpos`."""
         # Brax has it in its `sys`.
-        owners = self.source, getattr(self.source, "sys", None)
+        owners: list[Any] = [self.source, getattr(self.source, "sys", None)]
         model = next((x.mj_model for x in owners if hasattr(x, "mj_model")), None)
         return model if isinstance(model, mujoco.MjModel) and self._qpos else None
 

@@ -57,9 +57,11 @@ def as_foreign(source: Any) -> Foreign:
     Raises:
       InvalidError: it has neither.
     """
-    env, params = source if isinstance(source, tuple) and len(source) == 2 else (source, None)
+    # `gymnax.make` returns an environment and its parameters.
+    env: Any = source[0] if isinstance(source, tuple) else source
+    params = source[1] if isinstance(source, tuple) else None
     if callable(getattr(env, "step_env", None)) and callable(getattr(env, "reset_env", None)):
-        return _gymnax(env, params or env.default_params)
+        return _gymnax(env, env.default_params if params is None else params)
     lacks = [name for name in ("reset", "step") if not callable(getattr(source, name, None))]
     if lacks:
         raise InvalidError(

@@ -88,6 +88,11 @@ class JetBotEnv(Env):
         Raises:
           UserError: the task or its scene cannot be built.
         """
+        if config.environment is not None:
+            raise InvalidError(
+                f"environment = {config.environment!r} takes the place of the robot and its task:"
+                " make_env builds it"
+            )
         self.config = config
         self.task: Task = make_task(config.task, task_class)
         self.robot = config.robot

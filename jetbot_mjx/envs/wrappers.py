@@ -85,7 +85,7 @@ def wrap_for_training(
         return NewEpisodeWrapper(EpisodeWrapper(one, episode_length, action_repeat))
 
     camera = None if final_images else env.camera
-    if randomization_fn is None:
+    if randomization_fn is None or isinstance(env, AdaptedEnv):
         return BatchWrapper(with_camera(KernelWrapper(wrap_one(env)), camera))
     return RandomizedBatchWrapper(
         env, lambda env: with_camera(wrap_one(env), camera), randomization_fn
