@@ -7,10 +7,10 @@ from typing import Any
 
 import jax
 
-from jetbot_mjx.config import MjcfRobotConfig
+from jetbot_mjx.config import MjcfRobotConfig, RobotConfig
 from jetbot_mjx.envs.drive import AckermannDrive, OwnDrive
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_trial import Trial, drive_trial
+from jetbot_mjx.envs.robot_trial import Trial, drive_trial, trial_turn
 from jetbot_mjx.envs.task import reach_on_floor
 
 _STEPS = 64
@@ -18,6 +18,12 @@ _STEPS = 64
 
 _WELL = 0.05
 """Largest share by which a robot may turn less or more than it is told, without a hint."""
+
+_WIDEST = 2.0
+"""Largest separation of wheels that a configuration may have [m]."""
+
+_TRIES = 6
+"""Most separations of wheels that are tried before one is proposed."""
 
 _BADLY = 0.3
 """Share from which a training is told so."""
@@ -60,14 +66,20 @@ def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
 
 
 def training_hints(env: JetBotEnv) -> list[str]:
-    """Return the settings without which a robot that is a model of its own may not learn.
+    """Return the settings without which a robot of a user's own may not learn.
 
     Args:
       env: one environment, unwrapped.
+
+    Raises:
+      UserError: it does not follow its commands at all.
     """
-    if env.trial is None:
+    trial = env.trial
+    if isinstance(env.robot, RobotConfig) and env.robot.label != env.robot.preset:
+        trial = drive_trial(env.config, env.physics.mj_model, env.drive)
+    if trial is None:
         return []
-    return [*_turn_hint(env, env.trial, _BADLY), *_goal_hints(env, env.trial)]
+    return [*_turn_hint(env, trial, _BADLY), *_goal_hints(env, trial)]
 
 
 def _turn_hint(env: JetBotEnv, trial: Trial, least: float) -> Iterator[str]:
@@ -85,10 +97,16 @@ def _turn_hint(env: JetBotEnv, trial: Trial, least: float) -> Iterator[str]:
         return
     own = isinstance(env.robot, MjcfRobotConfig)
     key = "wheel_separation" if own else "controller_wheel_separation"
-    fits = drive.wheel_separation / trial.turn
+    # A robot that skids does not turn in proportion: try what is proposed.
+    fits, turn = drive.wheel_separation, trial.turn
+    for _ in range(_TRIES):
+        fits = min(float(f"{fits / max(turn, _WELL):.2g}"), _WIDEST)
+        turn = trial_turn(env.physics.mj_model, drive._replace(wheel_separation=fits))
+        if abs(turn - 1.0) <= _WELL:
+            break
     yield (
         f"the robot turns with {trial.turn:.0%} of the yaw rate that is commanded:"
-        f" robot.{key} = {fits:.2g} would make that 100 %"
+        f" robot.{key} = {fits:.2g} would make that {turn:.0%}"
     )
 
 

@@ -95,6 +95,8 @@ class Training:
     """Parts that run slower than they could; others are added while programs are traced."""
     task_code: TaskCode | None = None
     """The source of the task that the run stores; None: it has none, or it is stored already."""
+    hints: Sequence[str] = ()
+    """Settings without which a robot of a user's own may not learn."""
     verbose: bool = True
     """Whether to show the progress."""
 
@@ -183,6 +185,7 @@ def _compose(
     setup = Setup(config, programs, task_class=task_class)
     if not envs.is_built_in(config.task.name):
         envs.require_trainable(setup.env.task, config)
+    hints = envs.training_hints(setup.env)
     ppo = ppo_trainer.build_ppo(setup)
     # Another run's policy is loaded only for a run without checkpoints of its own.
     warm_start = None
@@ -196,6 +199,7 @@ def _compose(
         warm_start=warm_start,
         fallbacks=fallbacks,
         task_code=task_code,
+        hints=hints,
         verbose=verbose,
     )
 
@@ -464,7 +468,7 @@ def _headline(training: Training) -> str:
     hosts = f" of {jax.process_count()} processes" if jax.process_count() > 1 else ""
     seeds = f", {config.seeds} seeds at once" if config.seeds > 1 else ""
     robot, *measures = config.robot.label.partition(" with ")
-    hints = "".join(f"\nhint: {one}" for one in envs.training_hints(training.setup.env))
+    hints = "".join(f"\nhint: {one}" for one in training.hints)
     return (
         f"training {config.task.name} ({robot} robot{''.join(measures)},"
         f" {config.task.observation} observation) with the {config.trainer} trainer:"
