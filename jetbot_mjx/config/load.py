@@ -105,6 +105,11 @@ def _with_robot_of_file(values: Mapping[str, object]) -> Mapping[str, object]:
     own = read_yaml(path, "robot.file")
     if "file" in own:
         raise ConfigError(f"robot.file {path}: file = {shown(own['file'])}: it is one itself")
+    if "robot" in own:
+        raise ConfigError(
+            f"robot.file {path}: it has a section robot, as a configuration has: it should be the"
+            " measures alone, such as wheel_radius: 0.04"
+        )
     camera = own.pop("camera", {})
     measures = parse_config({"robot": own, "camera": camera}, f"robot.file {path}").robot
     defaults = {"robot": measures.model_dump(mode="json"), "camera": camera}

@@ -121,6 +121,8 @@ class JetBotEnv(Env):
                 reason = f"MJX does not support {reason}"
             if isinstance(self.robot, MjcfRobotConfig):
                 raise RobotFileError(self.robot, reason) from None
+            if type(self.task).build_scene is GoalTask.build_scene:
+                raise UserError(f"robot {self.robot.label}: {reason}") from None
             raise UserError(
                 f"task.name = {config.task.name!r}: its scene cannot be simulated: {reason}"
                 f" (jetbot-mjx check-env {config.task.name} says more)"

@@ -104,6 +104,8 @@ class Training:
     """Parts that run slower than they could; others are added while programs are traced."""
     task_code: TaskCode | None = None
     """The source of the task that the run stores; None: it has none, or it is stored already."""
+    hints: Sequence[str] = ()
+    """Settings without which a robot of a user's own may not learn."""
     verbose: bool = True
     """Whether to show the progress."""
 
@@ -199,6 +201,7 @@ def _compose(
     if keep and not envs.is_built_in(config.code):
         # Only now it is known what the programs depend on.
         setup.programs = envs.open_program_cache(config, own=envs.own_fingerprint(setup.env))
+    hints = [] if isinstance(setup.env, AdaptedEnv) else envs.training_hints(setup.env)
     ppo = ppo_trainer.build_ppo(setup)
     # Another run's policy is loaded only for a run without checkpoints of its own.
     warm_start = None
@@ -212,6 +215,7 @@ def _compose(
         warm_start=warm_start,
         fallbacks=fallbacks,
         task_code=task_code,
+        hints=hints,
         verbose=verbose,
     )
 
@@ -503,14 +507,13 @@ def _headline(training: Training) -> str:
     if isinstance(env, AdaptedEnv):
         actions = "choices" if env.is_discrete else "actions"
         what = f"{config.code} ({env.observation_size} observations, {env.action_size} {actions})"
-        hints = ""
     else:
         robot, *measures = config.robot.label.partition(" with ")
         what = (
             f"{config.task.name} ({robot} robot{''.join(measures)},"
             f" {config.task.observation} observation)"
         )
-        hints = "".join(f"\nhint: {one}" for one in envs.training_hints(env))
+    hints = "".join(f"\nhint: {one}" for one in training.hints)
     return (
         f"training {what} with the {config.trainer} trainer:"
         f" {config.ppo.num_timesteps:,} steps in {config.ppo.num_envs:,} environments{seeds} on"
