@@ -6,8 +6,10 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from helpers.browser import tab
+from benchmarks.harness.browser import find_browser, open_tab
 from jetbot_mjx.deployment import write_web_page
+
+pytestmark = pytest.mark.skipif(find_browser() is None, reason="there is no Chromium")
 
 PAGE = "pretrained:jetbot_egocentric"
 
@@ -21,7 +23,7 @@ def page(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    with tab() as one:
+    with open_tab() as one:
         yield one
 
 
