@@ -101,7 +101,7 @@ def _written(prefix: str, robot: "_Robot", others: Mapping[str, Kernel]) -> WebE
     knobs = robot.knobs
     try:
         step = _kernel(robot.step, robot.words, robot.action, _floats(len(KNOBS)))
-    except (UnsupportedError, TypeError):
+    except (UnsupportedError, jax.errors.JAXTypeError):
         # A task may use its settings as plain numbers of Python: then they stay as they are.
         knobs, step = [], _kernel(robot.plain_step, robot.words, robot.action)
     kernels = {"reset": _kernel(robot.reset, _KEY), "step": step, **others}

@@ -102,6 +102,42 @@ def test_a_goal_goes_where_it_is_put_and_a_robot_is_driven_by_hand(open_page):
     tab.wait_for("Math.abs(jetbot.fleet.action(0)[1] - 1) < 1e-6")
 
 
+TOUCH = """
+(() => {
+  const { simulation } = jetbot.app, { fleet } = simulation, robots = [0, 1];
+  jetbot.app.setPaused(true);
+  simulation.setDriver(simulation.driver);
+  const until = (ended) => { while (!ended()) simulation.step(); };
+  // One goal is put before its robot, another robot is pushed; both episodes end.
+  const [x, y] = fleet.robots.numbers("qpos", 0);
+  simulation.setGoal(0, x, y);
+  simulation.push(1);
+  const seen = robots.map(() => 0);
+  until(() => robots.every((robot) => (seen[robot] += fleet.done[robot])));
+  return [simulation.score, fleet.episodes, fleet.successes, simulation.touched.size, seen];
+})()
+"""
+
+
+def test_episodes_that_a_visitor_changes_do_not_count(open_page):
+    tab = open_page(1280, 720)
+    score, episodes, successes, touched, seen = tab.run(TOUCH)
+    assert min(seen) >= 1
+    assert touched == 0
+    # One episode of each robot is left out; the one whose goal is at its place has reached it.
+    assert score["episodes"] == episodes - 2
+    assert successes - 2 <= score["successes"] <= successes - 1
+    # A robot that is driven by hand counts for its driver alone.
+    tab.run("jetbot.app.setManual(true)")
+    counted = tab.run(
+        "(() => { const { simulation } = jetbot.app, { chosen, mine } = simulation;"
+        " const before = simulation.score.episodes, all = simulation.fleet.episodes;"
+        " while (mine.episodes < 1) simulation.step();"
+        " return [simulation.score.episodes - before, simulation.fleet.episodes - all]; })()"
+    )
+    assert counted[0] == counted[1] - 1
+
+
 def test_a_browser_without_webgl_is_told_in_one_line(browser, page, tmp_path):
     # Without WebGL 2, a canvas has no such context.
     spoilt = page.read_text("utf-8").replace('getContext("webgl2"', 'getContext("webgl9"')

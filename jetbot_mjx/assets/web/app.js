@@ -48,6 +48,7 @@ class Simulation {
     this.hand = new Float32Array(2); // the action of whoever drives by hand
     this.byHand = false;
     this.knobs = {}; // what the visitor changed
+    this.touched = new Set(); // robots in whose episode the visitor moved the goal, pushed or drove
   }
 
   setCount(count) {
@@ -55,6 +56,7 @@ class Simulation {
     Object.assign(this.fleet.knobs, this.knobs);
     const half = Math.sqrt(count) >> 1;
     this.chosen = half * Math.ceil(Math.sqrt(count)) + half; // in the middle
+    this.touched.clear();
     this.scene.setFleet(this.fleet);
     this.setDriver(this.driver);
     this.takeWheel(this.byHand);
@@ -83,7 +85,8 @@ class Simulation {
 
   resetCounters() {
     this.fleet.resetCounters();
-    this.mine = { episodes: 0, successes: 0 };
+    this.mine = { episodes: 0, successes: 0 }; // by hand
+    this.others = { episodes: 0, successes: 0 }; // touched
   }
 
   /** Chooses a robot. Whoever drives by hand drives that one. */
@@ -98,10 +101,12 @@ class Simulation {
     this.byHand = byHand;
     this.hand.set([-1, 0]);
     this.fleet.drive(this.chosen, byHand ? this.hand : null);
+    if (byHand) this.touched.add(this.chosen);
   }
 
   setGoal(robot, x, y) {
     this.fleet.setGoal(robot, x, y);
+    this.touched.add(robot);
     this.scene.refreshGoal(robot);
   }
 
@@ -109,6 +114,7 @@ class Simulation {
   push(robot) {
     const angle = Math.random() * 2 * Math.PI, spin = Math.random() < 0.5 ? -6 : 6;
     this.fleet.push(robot, PUSH_SPEED * Math.cos(angle), PUSH_SPEED * Math.sin(angle), spin);
+    this.touched.add(robot);
   }
 
   /** Makes the steps that belong to some seconds of real time, but for those that take too long. */
@@ -129,11 +135,16 @@ class Simulation {
   }
 
   step() {
-    const { fleet, chosen, mine } = this;
+    const { fleet, touched, mine, others } = this;
     fleet.step();
-    if (this.byHand && fleet.done[chosen]) {
-      mine.episodes++;
-      mine.successes += fleet.success[chosen];
+    for (const robot of touched) {
+      if (!fleet.done[robot]) continue;
+      const driven = this.byHand && robot === this.chosen;
+      for (const counter of driven ? [others, mine] : [others]) {
+        counter.episodes++;
+        counter.successes += fleet.success[robot];
+      }
+      if (!driven) touched.delete(robot);
     }
     this.scene.record();
   }
@@ -143,10 +154,10 @@ class Simulation {
     return Math.min(1, this.backlog / this.data.meta.dt);
   }
 
-  /** Goals reached by others than the visitor, and their episodes. */
+  /** Goals reached without the visitor, and the episodes of these robots. */
   get score() {
-    const { fleet, mine } = this;
-    return { successes: fleet.successes - mine.successes, episodes: fleet.episodes - mine.episodes };
+    const { fleet, others } = this;
+    return { successes: fleet.successes - others.successes, episodes: fleet.episodes - others.episodes };
   }
 }
 
