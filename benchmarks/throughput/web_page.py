@@ -44,7 +44,7 @@ SIZE = (1280, 720)
 ROBOTS = (64, 1024)
 AIM = 0.95
 LOADS, FRAME_SECONDS, TRAINING_SECONDS = 5, 6.0, 120.0
-_EARLY = ("--set", "checkpoint_interval=16_384")
+_EARLY = ("--set", "checkpoint_interval=49_152")
 _ALLOWED = ("default-src", "script-src", "style-src", "worker-src")
 
 # The frame after the first that was drawn has it on the screen.
