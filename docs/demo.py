@@ -39,7 +39,7 @@ def page_texts() -> Mapping[str, str]:
     """Return the pages as HTML by their names, the same ones whenever the site is built again."""
     pages = {}
     with tempfile.TemporaryDirectory() as folder:
-        # The first checkpoint is the early one, which reaches most goals, by detours.
+        # The first checkpoint is the early one.
         run = Path(folder, TRAINED)
         train(TRAINED, {"checkpoint_interval": 49_152}, run_dir=run)
         for name, source in PAGES.items():

@@ -104,7 +104,13 @@ class Simulation {
     if (byHand) this.touched.add(this.chosen);
   }
 
+  /** Whether the task lets a visitor move a goal. */
+  get movesGoals() {
+    return this.data.meta.robot_functions.functions.includes("move");
+  }
+
   setGoal(robot, x, y) {
+    if (!this.movesGoals) return;
     this.fleet.setGoal(robot, x, y);
     this.touched.add(robot);
     this.scene.refreshGoal(robot);
@@ -186,7 +192,7 @@ class Gestures {
     const hit = scene.pick(x, y, event.pointerType === "touch" ? 30 : 16);
     this.moved = 0;
     this.hit = hit;
-    if (hit?.goal && event.button === 0) {
+    if (hit?.goal && event.button === 0 && this.simulation.movesGoals) {
       this.mode = "goal";
       this.choose(hit.robot);
     } else this.mode = event.button === 0 && !event.shiftKey ? "orbit" : "pan";
@@ -249,7 +255,7 @@ class Gestures {
   /** Shows by the cursor what a press would do. */
   #look(hit = this.hit) {
     const drags = this.mode === "goal" || this.mode === "pan";
-    const name = drags ? "drag" : hit ? (hit.goal ? "grab" : "point") : "";
+    const name = drags ? "drag" : hit ? (hit.goal && this.simulation.movesGoals ? "grab" : "point") : "";
     if (this.canvas.className !== name) this.canvas.className = name;
   }
 }
@@ -373,7 +379,7 @@ class RobotPanel {
       const numbers = Array.from(observation.subarray(start, start + size), (x) => RobotPanel.#signed(x, 2));
       write(value, numbers.join(", "));
     }
-    const { max_speed: speed, max_yaw_rate: yaw } = this.meta;
+    const { max_yaw_rate: yaw } = this.meta, speed = this.meta.max_speed === null ? null : fleet.knobs.maxSpeed;
     const units = [`${((Math.max(-1, action[0]) + 1) / 2 * speed).toFixed(2)} m/s`, yaw === null ? "" : `${RobotPanel.#signed(action[1] * yaw, 2)} rad/s`];
     const shown = speed === null ? Array.from(action, (x) => RobotPanel.#signed(x, 2)) : units;
     for (const [i, { fill, output }] of this.meters.entries()) {
@@ -385,7 +391,8 @@ class RobotPanel {
   }
 
   static #signed(x, digits) {
-    return `${x < 0 ? "−" : "+"}${Math.abs(x).toFixed(digits)}`;
+    const text = Math.abs(x).toFixed(digits);
+    return `${x < 0 && Number(text) > 0 ? "−" : "+"}${text}`;
   }
 
   #drawImage(image) {
@@ -613,6 +620,7 @@ class App {
     // A drive that is a function of its own has no speed and no yaw rate that others could command.
     if (this.meta.max_speed !== null) drivers.push(["scripted", "Scripted", "no network"]);
     byId("manual").hidden = this.meta.max_speed === null;
+    byId("move-goals").hidden = !this.simulation.movesGoals;
     drivers.push(["learning", "Learning", "in this page"]);
     this.#choices(byId("drivers"), "driver", drivers, `policy ${policies.length - 1}`, (name) => this.setDriver(name));
     this.learning = document.querySelector("input[value=learning]");
