@@ -404,7 +404,7 @@ class Fleet {
     this.robots.reset(this.keys);
     this.done.fill(1);
     this.time = 0;
-    if (this.eyes) this.eyes.look(this.done);
+    if (this.eyes && this.policy) this.eyes.look(this.done);
     this.done.fill(0);
   }
 
@@ -413,8 +413,11 @@ class Fleet {
     // All policies of a page have layers of the same sizes.
     if (policy && this.network) this.network.load(policy);
     else if (policy) this.network = new Network(this.memory, policy, this.count);
+    const sees = this.eyes && policy && !this.policy;
     this.policy = policy && this.network;
     this.scripted = false;
+    // While others drove, nobody looked.
+    if (sees) this.eyes.look(new Uint8Array(this.count).fill(1));
   }
 
   /** Makes one step of all robots, `meta.dt` seconds. */
@@ -431,7 +434,7 @@ class Fleet {
       this.successes += success[robot];
     }
     this.time += this.meta.dt;
-    if (this.eyes) this.eyes.look(done);
+    if (this.eyes && this.policy) this.eyes.look(done);
   }
 
   /** Position (x, y, z) [m] and quaternion (w, x, y, z) of each body of each robot, in the world's frame. */
@@ -541,14 +544,19 @@ class Eyes {
     this.rendered = memory.array(Math.ceil((count * height * width * channels) / 4), Uint32Array);
   }
 
+  /** Renders the images of some robots, from the first one on, and returns their bytes. */
+  #render(first, count) {
+    const { robots, meta } = this.fleet, { shared, table, rendered } = this, { height, width, channels } = meta.image;
+    robots.call("frame", robots.words.address + 4 * first * robots.about.words, shared.address, count);
+    robots.call("image", shared.address, table.address, rendered.address, count);
+    return new Uint8Array(rendered.memory.buffer, rendered.address, count * height * width * channels);
+  }
+
   /** Renders the images of all robots; those that begin an episode have copies of the first one. */
   look(begins) {
-    const { robots, count, meta } = this.fleet, { channels, frames } = meta.image, stacked = channels * frames;
-    robots.call("frame", robots.words.address, this.shared.address, count);
-    robots.call("image", this.shared.address, this.table.address, this.rendered.address, count);
-    const { bytes, size } = this, pixels = size / stacked;
-    const images = new Uint8Array(this.rendered.memory.buffer, this.rendered.address, count * pixels * channels);
-    if (frames === 1) return bytes.set(images);
+    const { count, meta } = this.fleet, { channels, frames } = meta.image, stacked = channels * frames;
+    const { bytes, size } = this, images = this.#render(0, count);
+    if (frames === 1) return void bytes.set(images);
     for (let robot = 0, from = 0; robot < count; robot++) {
       const first = begins[robot] ? 0 : stacked - channels, end = (robot + 1) * size;
       for (let to = robot * size; to < end; to += stacked, from += channels) {
@@ -558,13 +566,8 @@ class Eyes {
     }
   }
 
-  /** Returns a robot's newest image. */
+  /** Renders a robot's image, whose bytes stay until the next one is rendered. */
   newest(robot) {
-    const { channels, frames } = this.fleet.meta.image, stacked = channels * frames, { bytes, size } = this;
-    const image = new Uint8Array(size / frames);
-    for (let pixel = 0; pixel < size / stacked; pixel++)
-      for (let channel = 0; channel < channels; channel++)
-        image[pixel * channels + channel] = bytes[robot * size + (pixel + 1) * stacked - channels + channel];
-    return image;
+    return this.#render(robot, 1);
   }
 }
