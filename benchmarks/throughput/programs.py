@@ -11,10 +11,11 @@ these are known and one kernel allows them. These differ:
 - `search` has a table of 2²² numbers in its report, which is closed: XLA has become fast.
 - `orbits` takes leapfrog steps in place of Kepler's motion.
 
-`--num-instances` runs another number of each at once, by `jax.vmap`. Both ways are timed in turn in
-every round. A time is that of the shortest call of a round, and the median of all rounds: other
-programs on the machine change it little. `ratio` is the time of XLA divided by that of the kernel,
-and `difference` how far apart their results are, relative to the largest number.
+Each runs for as many instances as in its report and for 256, by `jax.vmap`, unless
+`--num-instances` names others. Both ways are timed in turn in every round. A time is that of the
+shortest call of a round, and the median of all rounds: other programs on the machine change it
+little. `ratio` is the time of XLA divided by that of the kernel, and `difference` how far apart
+their results are, relative to the largest number.
 
 For a single instance, `bound` is a time that no program goes below: a call that does nothing, and
 the longest chain of operations that need one another (`longest_chain.py` says what it assumes).
@@ -40,7 +41,7 @@ from jaxtyping import Array, Float, Int, PyTree
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.harness.processes import last_within
-from benchmarks.harness.results import check_output, write
+from benchmarks.harness.results import check_output, counts, write
 from benchmarks.harness.timing import available_cores, warm_up
 from benchmarks.throughput.longest_chain import lower_bound, measure_times
 from jetbot_mjx import cli
@@ -331,19 +332,18 @@ class Compiled:
         return time.perf_counter() - start
 
 
-def measure(name: str, num_instances: int | None, rounds: int) -> Iterator[Row]:
+def measure(name: str, num_instances: int, rounds: int) -> Iterator[Row]:
     """Time a program both ways.
 
     Args:
       name: a key of `PROGRAMS`.
-      num_instances: number of instances; 1: without `jax.vmap`; None: that of the report.
+      num_instances: number of instances; 1: without `jax.vmap`.
       rounds: number of rounds, in each of which both are timed once.
 
     Yields:
       The row, without what XLA takes and then with it.
     """
-    function, shape, report, draw, reported = PROGRAMS[name]
-    num_instances = num_instances or reported
+    function, shape, report, draw, _ = PROGRAMS[name]
     rng, is_one = np.random.default_rng(0), num_instances == 1
     argument = jnp.asarray(draw(rng, shape if is_one else (num_instances, *shape)))
     batch = (lambda f: f) if is_one else jax.vmap
@@ -378,7 +378,7 @@ def measure(name: str, num_instances: int | None, rounds: int) -> Iterator[Row]:
     yield row
 
 
-def measure_within(limit: float, name: str, num_instances: int | None, rounds: int) -> Row:
+def measure_within(limit: float, name: str, num_instances: int, rounds: int) -> Row:
     """Return the row of `measure`, or what there is of it after so many seconds.
 
     Raises:
@@ -386,8 +386,7 @@ def measure_within(limit: float, name: str, num_instances: int | None, rounds: i
     """
     row, is_complete = last_within(limit, measure, name, num_instances, rounds)
     if row is None:
-        report, reported = PROGRAMS[name].report, PROGRAMS[name].num_instances
-        row = Row(name, f"https://github.com/{report}", num_instances or reported)
+        row = Row(name, f"https://github.com/{PROGRAMS[name].report}", num_instances)
     if is_complete:
         return row
     is_begun = row.kernel_seconds is not None or row.note
@@ -396,7 +395,7 @@ def measure_within(limit: float, name: str, num_instances: int | None, rounds: i
 
 
 _HEAD = (
-    f"{'program':26}{'instances':>10}{'kernel':>12}{'XLA':>12}{'ratio':>8}{'bound':>12}"
+    f"{'program':26}{'instances':>10}{'kernel':>13}{'XLA':>13}{'ratio':>8}{'bound':>12}"
     f"{'at most':>9}{'compiled in':>13}{'XLA':>8}{'difference':>12}"
 )
 
@@ -415,7 +414,7 @@ def table_line(row: Row) -> str:
 
     kernel, xla, bound = row.kernel_seconds, row.xla_seconds, row.bound_seconds
     return (
-        f"{row.program:26}{row.num_instances:10,}{microseconds(kernel):>12}{microseconds(xla):>12}"
+        f"{row.program:26}{row.num_instances:10,}{microseconds(kernel):>13}{microseconds(xla):>13}"
         f"{ratio(kernel):>8}{microseconds(bound):>12}{ratio(bound):>9}"
         f"{text(row.kernel_compile_seconds, '.1f', ' s'):>13}"
         f"{text(row.xla_compile_seconds, '.1f', ' s'):>8}{text(row.difference, '.0e'):>12}"
@@ -438,7 +437,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "programs", nargs="*", default=names, metavar="NAME", help=f"of {', '.join(names)}"
     )
     parser.add_argument(
-        "--num-instances", type=cli.positive_int, help="without it: as many as in the report"
+        "--num-instances",
+        type=counts,
+        metavar="N[,N...]",
+        help="(default: as many as in the report, and 256)",
     )
     parser.add_argument("--rounds", type=cli.positive_int, default=5)
     parser.add_argument(
@@ -460,8 +462,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(_HEAD)
     rows = []
     for name in options.programs:
-        rows.append(measure_within(options.limit, name, options.num_instances, options.rounds))
-        print(table_line(rows[-1]), flush=True)
+        for count in options.num_instances or (PROGRAMS[name].num_instances, 256):
+            rows.append(measure_within(options.limit, name, count, options.rounds))
+            print(table_line(rows[-1]), flush=True)
     if options.output:
         about = {"device": device.device_kind, "cpu_cores": available_cores()}
         about |= {"versions": versions(), "rows": [row._asdict() for row in rows]}
