@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import MissingPackageError
 from onekernel import explain, fuse
 
@@ -144,6 +145,18 @@ def test_a_step_is_one_kernel(task, capsys):
     explain(task.step, state, jax.ShapeDtypeStruct((task.env.action_size,), jnp.float32))
     lines = capsys.readouterr().out.splitlines()
     assert [x for x in lines if "kernel" in x] == ["reset is one kernel", "step is one kernel"]
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_configurations_are_of_these_tasks(name, root):
+    config = load_config(root / "examples" / f"{name}.yaml")
+    assert config.environment == f"{name}:{CLASSES[name]}"
+    # The fused kernels take both networks alike.
+    network = config.ppo.network
+    assert network.policy_hidden_layer_sizes == network.value_hidden_layer_sizes
+    if name in GYMNASIUM:
+        spec = pytest.importorskip("gymnasium").spec(GYMNASIUM[name][1])
+        assert config.task.episode_length == spec.max_episode_steps
 
 
 @pytest.mark.parametrize("name", GYMNASIUM)
