@@ -19,9 +19,15 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var
 
 from onekernel.kernel import Kernel
-from onekernel.lower import ScalarProgram
-from onekernel.lower.scalar_ir import Expr, Scalar, is_constant
-from onekernel.lower.schedule import Block, PlacedLoop
+from onekernel.lower import (
+    Block,
+    Expr,
+    LateProgram,
+    PlacedLoop,
+    Scalar,
+    ScalarProgram,
+    is_constant,
+)
 
 _OF_DERIVATIVES = {"jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "jvp", "fwd"}
 """Parameters that only derivatives depend on."""
@@ -34,8 +40,9 @@ def fingerprint(*functions: ClosedJaxpr) -> str | None:
       functions: the functions, as `jax.make_jaxpr` returns them.
 
     Returns:
-      The hash, which is equal in another process for the same functions; None: a function depends
-      on something that has no such hash, such as a call of Python.
+      The hash, which is equal in another process for the same functions, settings of JAX and
+      versions of JAX, MuJoCo, MJX and this package; None: a function depends on something that has
+      no such hash, such as a call of Python.
     """
     hasher = _Hasher()
     try:
@@ -147,7 +154,9 @@ class _Hasher:
         self.add([str(x) for x in kernel.result_dtypes or ()])
         for program in (kernel.before, kernel.program, kernel.after):
             self._word(program is None)
-            if program is not None:
+            if isinstance(program, LateProgram):
+                self._word(program.identity)
+            elif program is not None:
                 self._program(program)
 
     def _program(self, program: ScalarProgram) -> None:

@@ -25,6 +25,7 @@ Protocol: JAX sees the kernel as a primitive.
 
 import contextlib
 import dataclasses
+import functools
 import math
 import threading
 import warnings
@@ -40,8 +41,8 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, PyTree, UInt8
 
 from onekernel.codegen import require
-from onekernel.errors import KernelError
-from onekernel.lower import ScalarProgram, scalarize
+from onekernel.errors import KernelError, UnsupportedError
+from onekernel.lower import LateProgram, ScalarProgram, scalarize
 
 
 def warn_of_fallback(reason: str) -> None:
@@ -113,8 +114,18 @@ class Kernel:
           UnsupportedError: one of them has an operation that has no LLVM instruction.
         """
         for program in (self.before, self.program, self.after):
-            if program is not None:
+            if program is not None and not isinstance(program, LateProgram):
                 require(program)
+
+    @functools.cached_property
+    def unsupported(self) -> UnsupportedError | None:
+        """Return why a kernel whose program is lowered late cannot be one; None: it can."""
+        try:
+            if isinstance(self.program, LateProgram):
+                require(self.program.lowered)
+        except UnsupportedError as error:
+            return error
+        return None
 
     def as_step(self) -> Step:
         """Return the kernel as a JAX function of one instance, which `jax.vmap` can batch.
@@ -159,7 +170,7 @@ class Kernel:
     @property
     def argument_shapes(self) -> list[tuple[int, ...]]:
         """Return the shapes of the arguments of one instance."""
-        shapes = [array.shape for array in (self.before or self.program).inputs]
+        shapes = (self.before or self.program).input_shapes
         return shapes if self.table is None else shapes[:-1]
 
     def results(self, *batch: int) -> list[jax.ShapeDtypeStruct]:
@@ -167,7 +178,7 @@ class Kernel:
         if self.table is not None:
             size = self.table.shape[1] * len(self.program.outputs)
             return [jax.ShapeDtypeStruct((*batch, size), np.uint8)]
-        shapes = [array.shape for array in (self.after or self.program).outputs]
+        shapes = (self.after or self.program).output_shapes
         dtypes = self.result_dtypes or [np.dtype(np.float32)] * len(shapes)
         return [
             jax.ShapeDtypeStruct((*batch, *shape), dtype)
@@ -386,11 +397,14 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
             for x, shape in zip(leaves, kernel.argument_shapes, strict=True)
         ]
         # Run the kernel where its back end is allowed and works, the fallback where `auto` permits.
-        if backend and kernel.impl in ("auto", backend.IMPL) and not backend.obstacle():
+        usable = backend and kernel.impl in ("auto", backend.IMPL) and not backend.obstacle()
+        if backend and usable and not kernel.unsupported:
             table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
             results = backend.launch(kernel, [*flat, *table])
         elif kernel.impl == "auto":
             obstacle = backend.obstacle() if backend else "there are no kernels for this platform"
+            if usable:
+                obstacle = f"one kernel cannot do {kernel.unsupported}"
             if obstacle:
                 kernel.on_fallback(obstacle)
             # The fallback is written for one instance.

@@ -21,6 +21,7 @@ This is the only module that needs MuJoCo and MJX: `pip install mujoco-mjx`.
 
 import contextlib
 import dataclasses
+import hashlib
 import io
 import threading
 import warnings
@@ -36,7 +37,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from onekernel.backends import Kernel, default_backend
 from onekernel.errors import KernelError, UnsupportedError
 from onekernel.kernel import is_debugging
-from onekernel.lower import scalarize
+from onekernel.lower import LateProgram, scalarize
 
 # MJX prints two lines where its optional part Warp is not installed.
 with contextlib.redirect_stdout(io.StringIO()):
@@ -90,7 +91,7 @@ class MjxState:
 class FusedMjx:
     """A `FusedMjx` steps one instance of a model; `fuse_mjx` makes it, and `jax.vmap` batches it.
 
-    The step is lowered at its first call. It cannot be differentiated.
+    The step is lowered when it is first compiled. It cannot be differentiated.
     """
 
     def __init__(
@@ -109,7 +110,7 @@ class FusedMjx:
                 raise UnsupportedError(f"MJX cannot step this model: {reason}") from None
         # What is in `MjData` after a reset, such as the positions of mocap bodies.
         self._first = mujoco.MjData(mj_model)
-        self._kernels: dict[tuple[str, ...], Kernel | UnsupportedError] = {}
+        self._kernels: dict[tuple[str, ...], Kernel] = {}
         self._warned: set[str] = set()
         # Programs are traced in several threads; only one of them lowers the step.
         self._lock = threading.RLock()
@@ -159,30 +160,23 @@ class FusedMjx:
         words = {name: jnp.asarray(x, self._dtype) for name, x in fields.items() if x.size}
         carry = {name: x for name, x in words.items() if name in _CARRIED}
         held = {name: x for name, x in words.items() if name not in _CARRIED}
-        found = self._find_kernel((*held,))
-        if is_debugging():
-            step = self._xla_step
-        elif not isinstance(found, UnsupportedError):
-            step = found.as_step()
-        elif self._on_unsupported == "raise":
-            raise found
-        else:
-            self._warn_once(_in_words(found))
-            step = self._xla_step
+        kernel = self._find_kernel((*held,))
+        if self._on_unsupported == "raise" and kernel.unsupported:
+            raise kernel.unsupported
+        step = self._xla_step if is_debugging() else kernel.as_step()
         return MjxState(**{name: fields[name] for name in vars(state)} | step(carry, held))
 
     @property
     def kernel(self) -> Kernel | None:
         """Return the kernel of a step without applied forces; None: there is none."""
-        found = self._find_kernel(self._held)
-        return None if isinstance(found, UnsupportedError) else found
+        kernel = self._find_kernel(self._held)
+        return None if kernel.unsupported else kernel
 
     @property
     def obstacle(self) -> str | None:
         """Return why XLA compiles the step on JAX's default device; None: it is one kernel."""
-        found = self._find_kernel(self._held)
-        if isinstance(found, UnsupportedError):
-            return _in_words(found)
+        if error := self._find_kernel(self._held).unsupported:
+            return f"one kernel cannot do {error}"
         backend = default_backend()
         return "there is no back end for this device" if backend is None else backend.obstacle()
 
@@ -265,18 +259,15 @@ class FusedMjx:
         """Return the names of what is given to a step without applied forces, and held."""
         return tuple(x for x in (*_HELD, "ctrl") if getattr(self._data, x).size)
 
-    def _find_kernel(self, held: tuple[str, ...]) -> Kernel | UnsupportedError:
-        """Return the kernel for some given fields, which is lowered once, or why there is none."""
+    def _find_kernel(self, held: tuple[str, ...]) -> Kernel:
+        """Return the kernel for some given fields, which is made once."""
         with self._lock:
             if held not in self._kernels:
-                try:
-                    self._kernels[held] = self._lower(held)
-                except UnsupportedError as error:
-                    self._kernels[held] = error
+                self._kernels[held] = self._make_kernel(held)
             return self._kernels[held]
 
-    def _lower(self, held: tuple[str, ...]) -> Kernel:
-        """Lower a physics step to a kernel that repeats it `n_substeps` times."""
+    def _make_kernel(self, held: tuple[str, ...]) -> Kernel:
+        """Return a kernel that repeats a physics step `n_substeps` times; it is lowered later."""
 
         def shapes(names: tuple[str, ...]) -> dict[str, jax.ShapeDtypeStruct]:
             arrays = {name: getattr(self._data, name) for name in names}
@@ -287,9 +278,17 @@ class FusedMjx:
             }
 
         arguments = shapes(_CARRIED), shapes(held)
-        structure = jax.tree.structure(arguments)
+        leaves, structure = jax.tree.flatten(arguments)
+        content = np.zeros(mujoco.mj_sizeModel(self.mj_model), np.uint8)
+        mujoco.mj_saveModel(self.mj_model, None, content)
+        program = LateProgram(
+            lambda: scalarize(self._substep, *arguments),
+            [x.shape for x in leaves],
+            [x.shape for x in jax.tree.leaves(arguments[0])],
+            f"mjx.step {hashlib.sha256(content.tobytes()).hexdigest()} {held}",
+        )
         return Kernel(
-            scalarize(self._substep, *arguments),
+            program,
             carried=len(arguments[0]),
             steps=self.n_substeps,
             fallback=lambda *leaves: jax.tree.leaves(
@@ -336,11 +335,6 @@ def fuse_mjx(
     if on_unsupported not in get_args(OnUnsupported):
         raise ValueError(f"on_unsupported is {on_unsupported!r}, not warn, xla or raise")
     return FusedMjx(mj_model, n_substeps, on_unsupported)
-
-
-def _in_words(error: UnsupportedError) -> str:
-    """Return why a model is not one kernel."""
-    return f"one kernel cannot do {error}"
 
 
 def _explain(error: KernelError) -> Exception:

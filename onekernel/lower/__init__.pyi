@@ -1,6 +1,7 @@
 from .control_flow import MAX_ARRAY_BYTES as MAX_ARRAY_BYTES
 from .control_flow import scan_ends as scan_ends
 from .evaluation import evaluate as evaluate
+from .jaxpr import LateProgram as LateProgram
 from .jaxpr import ScalarProgram as ScalarProgram
 from .jaxpr import scalarize as scalarize
 from .jaxpr import scalarize_part as scalarize_part

@@ -90,6 +90,16 @@ class ScalarProgram:
     """All operations, in an order in which they can be executed."""
 
     @property
+    def input_shapes(self) -> list[tuple[int, ...]]:
+        """Return the shapes of the inputs."""
+        return [array.shape for array in self.inputs]
+
+    @property
+    def output_shapes(self) -> list[tuple[int, ...]]:
+        """Return the shapes of the outputs."""
+        return [array.shape for array in self.outputs]
+
+    @property
     def size(self) -> int:
         """Return the number of operations; each scalar that is stored in an array is one, too."""
         stores = sum(len(array.operands) for array in self.block.arrays())
@@ -99,6 +109,67 @@ class ScalarProgram:
     def array_bytes(self) -> int:
         """Return the bytes of memory that the arrays of one instance take."""
         return sum(4 * length_of(array) for array in self.block.arrays())
+
+
+class LateProgram(ScalarProgram):
+    """A `LateProgram` is lowered when its operations are first asked for.
+
+    Most processes find compiled what is around it, and need to know no more than its shapes.
+    """
+
+    def __init__(
+        self,
+        lower: Callable[[], ScalarProgram],
+        input_shapes: Sequence[tuple[int, ...]],
+        output_shapes: Sequence[tuple[int, ...]],
+        identity: str,
+    ) -> None:
+        """Describe a program.
+
+        Args:
+          lower: lowers it.
+          input_shapes: the shapes of the inputs.
+          output_shapes: the shapes of the outputs.
+          identity: what it is lowered from, by which it is known in other processes.
+        """
+        vars(self).update(_lower=lower, identity=identity)
+        vars(self).update(_inputs=list(input_shapes), _outputs=list(output_shapes))
+
+    identity: str
+
+    @functools.cached_property
+    def lowered(self) -> ScalarProgram:
+        """Return the program.
+
+        Raises:
+          UnsupportedError: the function has an operation that cannot be lowered.
+        """
+        return vars(self)["_lower"]()
+
+    @property
+    def inputs(self) -> list[ScalarArray]:
+        """Return the scalars of the arguments."""
+        return self.lowered.inputs
+
+    @property
+    def outputs(self) -> list[ScalarArray]:
+        """Return the scalars of the result."""
+        return self.lowered.outputs
+
+    @property
+    def block(self) -> Block:
+        """Return all operations."""
+        return self.lowered.block
+
+    @property
+    def input_shapes(self) -> list[tuple[int, ...]]:
+        """Return the shapes of the inputs."""
+        return vars(self)["_inputs"]
+
+    @property
+    def output_shapes(self) -> list[tuple[int, ...]]:
+        """Return the shapes of the outputs."""
+        return vars(self)["_outputs"]
 
 
 def scalarize(
