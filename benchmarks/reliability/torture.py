@@ -73,6 +73,7 @@ class Process:
         run_dir: Path,
         settings: Sequence[str],
         program: Sequence[str] = TRAINER,
+        config: Path = CONFIG,
     ) -> None:
         """Start the process.
 
@@ -80,11 +81,12 @@ class Process:
           run_dir: The run folder; stdout and stderr are written into two files beside it.
           settings: The settings, as for `--set`.
           program: The arguments of Python that start the trainer.
+          config: The configuration.
         """
         self.run_dir = run_dir
         self._out, self._err = (run_dir.with_suffix(suffix) for suffix in (".out", ".err"))
         self._left_by_others = _unfinished(run_dir)
-        arguments = ["--config", str(CONFIG), "--run-dir", str(run_dir)]
+        arguments = ["--config", str(config), "--run-dir", str(run_dir)]
         for setting in settings:
             arguments += ["--set", setting]
         with self._out.open("w") as out, self._err.open("w") as err:
@@ -174,13 +176,19 @@ class Outcome(NamedTuple):
     """The lines of `metrics.jsonl`, without times."""
 
 
-def finish(run_dir: Path, settings: Sequence[str], program: Sequence[str] = TRAINER) -> Outcome:
+def finish(
+    run_dir: Path,
+    settings: Sequence[str],
+    program: Sequence[str] = TRAINER,
+    config: Path = CONFIG,
+) -> Outcome:
     """Run a training to its end, from its newest checkpoint if there is one.
 
     Args:
       run_dir: The run folder.
       settings: The settings, as for `--set`.
       program: The arguments of Python that start the trainer.
+      config: The configuration.
 
     Returns:
       The outcome of the training.
@@ -189,7 +197,7 @@ def finish(run_dir: Path, settings: Sequence[str], program: Sequence[str] = TRAI
       RecoveryError: The training failed.
     """
     known = checkpoint_steps(run_dir)
-    with Process(run_dir, settings, program) as process:
+    with Process(run_dir, settings, program, config) as process:
         code = process.wait()
     check_start(process, known)
     if code != 0:
@@ -211,10 +219,9 @@ def finish(run_dir: Path, settings: Sequence[str], program: Sequence[str] = TRAI
     )
 
 
-def make_template(settings: Sequence[str]) -> TrainState:
+def make_template(settings: Sequence[str], config: Path = CONFIG) -> TrainState:
     """Return the shapes and dtypes of the state that a training with these settings saves."""
-    config = load_config(CONFIG, settings)
-    return CompiledTrainer.from_setup(Setup(config)).template()
+    return CompiledTrainer.from_setup(Setup(load_config(config, settings))).template()
 
 
 def check_checkpoint(run_dir: Path, env_steps: int, template: TrainState) -> None:
@@ -291,6 +298,7 @@ def kill(
     aim: Aim,
     template: TrainState,
     program: Sequence[str] = TRAINER,
+    config: Path = CONFIG,
 ) -> Kill:
     """Start a training, kill it, and check its checkpoints.
 
@@ -300,6 +308,7 @@ def kill(
       aim: The moment of the kill.
       template: The shapes and dtypes of a state.
       program: The arguments of Python that start the trainer.
+      config: The configuration.
 
     Returns:
       The phase in which the process was killed.
@@ -310,7 +319,7 @@ def kill(
     """
     # Kill the process at its moment.
     known = checkpoint_steps(run_dir)
-    with Process(run_dir, settings, program) as process:
+    with Process(run_dir, settings, program, config) as process:
         process.until(_condition(process, known, aim))
         moment = time.monotonic() + aim.delay
         process.until(lambda: time.monotonic() > moment)
@@ -404,6 +413,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--kills", type=cli.positive_int, default=50, help="number of kills (default: 50)"
     )
+    parser.add_argument(
+        "--config", type=Path, default=CONFIG, help="configuration (default: configs/smoke.yaml)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the moments (default: 0)")
     options = parser.parse_args(arguments)
     jax.config.update("jax_platforms", "cpu")
@@ -416,20 +428,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         folder = Path(name)
         began = time.monotonic()
         # The reference runs undisturbed.
-        undisturbed = finish(folder / "undisturbed", settings)
+        undisturbed = finish(folder / "undisturbed", settings, config=options.config)
         print(f"undisturbed: {timesteps:,} steps, {time.monotonic() - began:.0f} s", flush=True)
         # The other is killed and restarted, and must end equal.
         kills: list[Kill] = []
         try:
-            template = make_template(settings)
+            template = make_template(settings, options.config)
             for aim in draw_aims(options.kills, random.Random(options.seed)):
-                kills.append(kill(folder / "killed", settings, aim, template))
+                run_dir = folder / "killed"
+                kills.append(kill(run_dir, settings, aim, template, config=options.config))
                 print(
                     f"{len(kills):>4}  {aim.event} + {aim.delay:.3f} s: {kills[-1].phase},"
                     f" {kills[-1].known} checkpoints, {time.monotonic() - began:.0f} s",
                     flush=True,
                 )
-            found = differences(undisturbed, finish(folder / "killed", settings))
+            killed = finish(folder / "killed", settings, config=options.config)
+            found = differences(undisturbed, killed)
             verdict = f"different at the end: {', '.join(found)}" if found else ""
         except (RecoveryError, UserError) as error:
             verdict = str(error)

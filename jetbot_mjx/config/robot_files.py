@@ -81,9 +81,15 @@ def model_files(digest: str) -> Mapping[str, bytes] | None:
 
 
 def _collect(
-    path: Path, root: Path, files: dict[str, bytes], trees: list[ElementTree.Element]
+    path: Path,
+    root: Path,
+    files: dict[str, bytes],
+    trees: list[ElementTree.Element],
+    within: tuple[Path, ...] = (),
 ) -> None:
     """Add a model's file and those that it includes, and what they hold."""
+    if path.resolve() in within:
+        raise ConfigError(f"robot.file {path}: it is a part of itself, by <include> or <model>")
     before = len(files)
     text = _read(path, root, files)
     if len(files) == before:
@@ -105,7 +111,7 @@ def _collect(
     trees.append(tree)
     for element in tree.iter():
         if element.tag in ("include", "model") and (name := element.get("file")):
-            _collect(root / name, root, files, trees)
+            _collect(root / name, root, files, trees, (*within, path.resolve()))
 
 
 def _check_numbers(path: Path, tree: ElementTree.Element) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jetbot_mjx.config import CameraConfig
+from jetbot_mjx.config import CameraConfig, MjcfRobotConfig
 from jetbot_mjx.deployment.numpy_policy import (
     CarController,
     Encoder,
@@ -72,6 +72,8 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
         spec["inside"].insert(-3, "normaliser")
     # Fill in what differs between policies; the limit of wheel speeds is in rad/s.
     _describe_drive(spec, policy, env)
+    if isinstance(config.robot, MjcfRobotConfig):
+        spec["frames"]["body"] = "that of the base in its model: x forward, y left, z up"
     return spec | {
         "run": checkpoint.run_dir.name,
         "env_steps": checkpoint.env_steps,

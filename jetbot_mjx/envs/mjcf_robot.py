@@ -22,6 +22,22 @@ _VIEWS = {"chase": ((-0.55, 0.0, 0.40), 30.0, 58.0), "onboard": ((0.031, 0.0, 0.
 _OPTIONS_OF_MODEL = ("integrator", "gravity", "density", "viscosity", "wind", "impratio")
 """Options of MuJoCo that a robot's model decides, beside the flags that disable a part of it."""
 
+_ONLY_IN_C = {
+    "actuator_delay": "the delay of an actuator (randomization.action_delay does)",
+    "actuator_damping": "the damping of an actuator (that of a joint it does)",
+    "actuator_dampingpoly": "the damping of an actuator (that of a joint it does)",
+    "actuator_armature": "the armature of an actuator (that of a joint it does)",
+    "dof_dampingpoly": "damping of a joint with more numbers than one",
+    "jnt_stiffnesspoly": "stiffness of a joint with more numbers than one",
+    "tendon_dampingpoly": "damping of a tendon with more numbers than one",
+    "tendon_stiffnesspoly": "stiffness of a tendon with more numbers than one",
+    "tendon_armature": "the armature of a tendon as MuJoCo does",
+    "geom_adhesion": "adhesion of a geom",
+    "pair_adhesion": "adhesion of a contact",
+    "geom_surfacevel": "the velocity of a geom's surface",
+}
+"""Arrays of a model that MJX takes for zero, by name, with what they are in a message."""
+
 _PARTS = {"body": "body", "jnt": "joint", "geom": "geom"}
 
 _LARGEST_MASS = 1000.0  # [kg] of a small robot
@@ -54,11 +70,38 @@ def load_spec(robot: MjcfRobotConfig) -> mujoco.MjSpec:
         )
     try:
         spec = parse_model(robot.file, files)
+        _check_joints(robot, spec)
         model = spec.copy().compile()
     except (ValueError, mujoco.FatalError) as error:
         raise RobotFileError(robot, f"MuJoCo refuses it: {error}") from None
     _check_numbers(robot, model)
+    _check_computed(robot, model)
     return spec
+
+
+def _check_joints(robot: MjcfRobotConfig, spec: mujoco.MjSpec) -> None:
+    """Check what MuJoCo would compile with a warning, and then not simulate."""
+    for joint in spec.joints:
+        for name in ("armature", "damping", "frictionloss"):
+            if (least := float(np.min(getattr(joint, name)))) < 0.0:
+                raise RobotFileError(
+                    robot,
+                    f"{joint.name or 'a joint'} has the {name} {least:g}: it should be 0 or more",
+                )
+
+
+def _check_computed(robot: MjcfRobotConfig, model: mujoco.MjModel) -> None:
+    """Check that a robot has nothing that C MuJoCo computes and MJX leaves out, unsaid."""
+    for name, what in _ONLY_IN_C.items():
+        if np.any(getattr(model, name)):
+            raise RobotFileError(robot, f"MJX does not compute {what}: leave it out")
+    limited = model.actuator_forcelimited.any() or model.jnt_actfrclimited.any()
+    if limited and model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        raise RobotFileError(
+            robot,
+            "with the integrator implicitfast MJX does not compute motors at their limits"
+            " (forcerange, actuatorfrcrange) as MuJoCo does: leave the integrator out",
+        )
 
 
 def _check_numbers(robot: MjcfRobotConfig, model: mujoco.MjModel) -> None:

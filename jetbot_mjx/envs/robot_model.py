@@ -104,8 +104,8 @@ def _check_stable(robot: RobotConfig, physics: PhysicsConfig) -> None:
     if physics.sim_dt >= limit:
         raise UserError(
             f"physics.sim_dt = {physics.sim_dt:g} is too long: this robot's motors are stable"
-            f" below {limit:.2g} s: make robot.motor_gain smaller, robot.armature larger, or"
-            " physics.n_substeps larger"
+            f" below {limit:.2g} s: make it shorter, robot.motor_gain smaller, or robot.armature"
+            " larger"
         )
 
 

@@ -24,6 +24,8 @@ _SLOWEST, _FASTEST = 0.3, 3.0  # of the commanded speed
 _LEAST_TURN = 0.02  # of the commanded turn
 _CURVE = (-0.6, 0.5)
 """Action of the curve: a fifth of the speed, and half of the largest turn."""
+_LEAST_FRICTION = 1e-3
+"""Sliding friction below which MuJoCo's pyramidal cone is too stiff to be solved."""
 _HOLD = 0.25  # [s] for which the trial of the motors holds a command
 
 
@@ -146,6 +148,14 @@ def _check_touch(
     mujoco.mj_forward(model, data)
     floor = model.geom("floor").id
     touching = {model.geom_bodyid[x] for pair in data.contact.geom if floor in pair for x in pair}
+    for contact in data.contact:
+        if contact.dim > 1 and contact.friction[0] < _LEAST_FRICTION:
+            geom = model.geom(max(contact.geom)).name.rpartition("/")[2] or "a geom"
+            raise _error(
+                config,
+                f"{geom} touches the floor with a friction of {contact.friction[0]:g}: give"
+                f' {_LEAST_FRICTION:g} or more, or condim="1" to what should slide freely',
+            )
     wheels = drive.driven if isinstance(drive, AckermannDrive) else drive.wheels
     for wheel in wheels:
         joint = model.actuator_trnid[wheel.actuator, 0]

@@ -25,9 +25,8 @@ def test_what_is_written_passes_the_check_and_trains(tmp_path, capsys, monkeypat
     assert "turn       " in capsys.readouterr().out
     with gliding.everywhere():
         assert session.run(load_config(config, TINY), tmp_path / "run").finished
-    # A robot that is a model is told that an episode of 16 steps is short.
-    told = "hint: a goal 1.2 m to the rear takes" in (tmp_path / "run" / "train.log").read_text()
-    assert told == (file == "r.xml")
+    # A robot of one's own is told that an episode of 16 steps is short.
+    assert "hint: a goal 1.2 m to the rear takes" in (tmp_path / "run" / "train.log").read_text()
     assert "turtlebot" not in config.read_text("utf-8")
 
 

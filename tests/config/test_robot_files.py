@@ -62,9 +62,19 @@ def test_what_is_no_model_is_refused_in_one_line(model, text, said):
     assert "\n" not in str(error.value)
 
 
-def test_a_model_that_includes_itself_ends(model):
-    model.write_text('<mujoco><include file="model.xml"/></mujoco>')
-    assert set(model_files(register(model))) == {"model.xml"}
+@pytest.mark.parametrize("part", ['<include file="{}"/>', '<asset><model file="{}"/></asset>'])
+@pytest.mark.parametrize("name", ["model.xml", "parts.xml"])
+def test_a_model_that_is_a_part_of_itself_is_refused(model, part, name):
+    model.write_text(f"<mujoco>{part.format(name)}</mujoco>")
+    (model.parent / "parts.xml").write_text(f"<mujoco>{part.format('model.xml')}</mujoco>")
+    with pytest.raises(ConfigError, match=r"model.xml: it is a part of itself"):
+        register(model)
+
+
+def test_a_model_may_have_a_part_twice(model):
+    (model.parent / "parts.xml").write_text("<mujoco/>")
+    model.write_text('<mujoco><model file="parts.xml"/><model file="parts.xml"/></mujoco>')
+    assert set(model_files(register(model))) == {"model.xml", "parts.xml"}
 
 
 def test_a_part_may_be_called_nan(model):

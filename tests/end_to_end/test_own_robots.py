@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from helpers.own_robots import copy_robot, load_robot
+from helpers.own_robots import OWN_ROBOTS, copy_robot, load_robot
 from helpers.tiny import TINY
 from jetbot_mjx import evaluate, export, render
 from jetbot_mjx.config import MjcfRobotConfig, load_config, robot_files
@@ -98,10 +98,12 @@ def test_it_is_evaluated_in_both_simulators_rendered_and_exported(trained, tmp_p
         assert [one["name"] for one in spec["action"]] == [f"action_{i}" for i in range(4)]
     elif isinstance(config.robot, MjcfRobotConfig):
         assert spec["wheel_speeds"]["order"] == ["wheel_speed", "curvature"]
+        assert spec["frames"]["body"].startswith("that of the base in its model")
         names = [one["name"] for one in spec["actuators"]]
         assert names == ["steer_left", "steer_right", "drive_left", "drive_right"]
     else:
         assert "actuators" not in spec
+        assert "axle midpoint" in spec["frames"]["body"]
 
 
 @every_kind
@@ -129,7 +131,7 @@ def test_a_model_that_was_changed_in_the_run_is_refused(trained):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["measures", "rover"])
+@pytest.mark.parametrize("kind", ["measures", *OWN_ROBOTS])
 def test_a_training_that_is_killed_ends_with_the_same_bits(kind, tmp_path):
     config = tmp_path / "mine.yaml"
     config.write_text(MEASURES)

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 
 import jax
 import jax.numpy as jnp
@@ -83,6 +84,44 @@ def test_a_broken_robot_gets_one_clear_line(tmp_path, monkeypatch, broken, capfd
     assert "\n" not in str(error.value)
     assert capfd.readouterr() == ("", "")
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+IMPLICIT = '<option integrator="implicitfast"/>'
+ARMATURE = 'armature="1.5e-3"'
+FIXED = '<fixed name="t" armature="1e-4"><joint joint="front_left" coef="1"/></fixed>'
+MOTOR = '<velocity name="fl"'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (MOTOR, f'{MOTOR} delay="0.1" nsample="10"', "the delay of an actuator (randomization."),
+        (MOTOR, f'{MOTOR} damping="0.05"', "the damping of an actuator (that of a joint it"),
+        (MOTOR, f'{MOTOR} armature="0.005"', "the armature of an actuator (that of a joint it"),
+        (ARMATURE, f'{ARMATURE} damping="0 1e-4"', "damping of a joint with more numbers than"),
+        (ARMATURE, f'{ARMATURE} stiffness="0 1e-4"', "stiffness of a joint with more numbers"),
+        (
+            "</mujoco>",
+            f"<tendon>{FIXED}</tendon></mujoco>",
+            "the armature of a tendon as MuJoCo does: leave it out",
+        ),
+        (
+            "<worldbody>",
+            '<option integrator="implicitfast"/><worldbody>',
+            "motors at their limits (forcerange, actuatorfrcrange) as MuJoCo does: leave",
+        ),
+    ],
+)
+def test_what_mjx_leaves_out_unsaid_is_refused(tmp_path, old, new, said):
+    with pytest.raises(UserError, match=re.escape(said)):
+        make_env(load_config(copy_robot(tmp_path, "rover", [(old, new)])))
+
+
+def test_motors_without_limits_may_be_integrated_implicitly(tmp_path):
+    changes = [('forcerange="-1.2 1.2"', ""), ("<worldbody>", IMPLICIT + "<worldbody>")]
+    env = make_env(load_config(copy_robot(tmp_path, "rover", changes)))
+    apart, _, _ = drive_both_ways(env, 4, 0.5)
+    assert apart.max() < 1e-5
 
 
 def test_a_model_that_this_process_has_not_read_is_asked_for():

@@ -145,5 +145,7 @@ def test_a_robot_that_sways_for_longer_is_waited_for():
 
 
 def test_motors_that_are_unstable_are_told_with_what_would_help():
-    with pytest.raises(UserError, match=r"stable below 6.3e-06 s: make robot.motor_gain smaller"):
+    with pytest.raises(
+        UserError, match=r"stable below 6.3e-06 s: make it shorter, robot.motor_gain"
+    ):
         make_mj_model(RobotConfig(preset="real", motor_gain=100.0), PhysicsConfig())

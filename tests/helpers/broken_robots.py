@@ -268,7 +268,22 @@ BROKEN = {
     "a file that includes itself": Broken(
         "turtlebot",
         (("<worldbody>", '<include file="turtlebot.xml"/><worldbody>'),),
-        "MuJoCo refuses it: XML Error: File 'turtlebot.xml' already included",
+        "turtlebot.xml: it is a part of itself, by <include> or <model>",
+    ),
+    "a model that is attached to itself": Broken(
+        "turtlebot",
+        (("<worldbody>", '<asset><model file="turtlebot.xml"/></asset><worldbody>'),),
+        "turtlebot.xml: it is a part of itself, by <include> or <model>",
+    ),
+    "tyres without friction": Broken(
+        "rover",
+        (('friction="0.8 ', 'friction="0 '),),
+        "tyre touches the floor with a friction of 1e-05: give 0.001 or more, or condim",
+    ),
+    "a negative armature": Broken(
+        "rover",
+        (('armature="1.5e-3"', 'armature="-1.5e-3"'),),
+        "front_left has the armature -0.0015: it should be 0 or more",
     ),
     "a file that includes another folder's": Broken(
         "turtlebot",
