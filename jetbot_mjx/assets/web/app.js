@@ -479,7 +479,7 @@ class TrainPanel {
     byId("curve").setAttribute("hidden", "");
     byId("no-learner").hidden = reason === null;
     byId("train").open = reason === null;
-    if (reason !== null) return write(byId("no-learner"), `Not in this page: ${reason}`);
+    if (reason !== null) return write(byId("no-learner"), `No training here, which needs the fused update: ${reason}.`);
     this.curve = new Curve(byId("curve"));
     byId("train").addEventListener("toggle", () => this.curve.draw());
     byId("start").addEventListener("click", () => this.#toggle());
