@@ -1,10 +1,16 @@
-"""Run a command of the package in a process of its own."""
+"""Run a command of the package, or a function, in a process of its own."""
 
+import multiprocessing
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
 
 from jetbot_mjx.errors import UserError
+
+T = TypeVar("T")
 
 
 def run_module(
@@ -30,3 +36,47 @@ def run_module(
         lines = done.stderr.strip().splitlines() or ["no error message"]
         raise UserError(f"{module} failed: {lines[-1]}")
     return done.stdout
+
+
+def last_within(
+    limit: float, function: Callable[..., Iterable[T]], *arguments: Any
+) -> tuple[T | None, bool]:
+    """Return the last thing that a function yields within so many seconds, in its own process.
+
+    The process is killed after this time, whatever it waits for.
+
+    Args:
+      limit: the time [s].
+      function: a function of a module.
+      arguments: its arguments.
+
+    Returns:
+      The last thing, or None, and whether the function came to its end.
+
+    Raises:
+      UserError: the process failed.
+    """
+    context, end = multiprocessing.get_context("spawn"), time.monotonic() + limit
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send, args=(sender, function, *arguments), daemon=True)
+    process.start()
+    sender.close()
+    last, is_complete = None, False
+    try:
+        while receiver.poll(max(0.0, end - time.monotonic())):
+            last = receiver.recv()
+    except EOFError:
+        process.join()
+        is_complete = True
+    finally:
+        process.kill()
+        process.join()
+    if is_complete and process.exitcode:
+        names = ", ".join(map(str, arguments))
+        raise UserError(f"the process of {function.__name__}({names}) failed")
+    return last, is_complete
+
+
+def _send(sender: Connection, function: Callable[..., Iterable[T]], *arguments: Any) -> None:
+    for each in function(*arguments):
+        sender.send(each)

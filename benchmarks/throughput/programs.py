@@ -11,16 +11,25 @@ these are known and one kernel allows them. These differ:
 - `search` has a table of 2²² numbers in its report, which is closed: XLA has become fast.
 - `orbits` takes leapfrog steps in place of Kepler's motion.
 
-`--num-instances` runs another number of each at once, by `jax.vmap`. Both ways are timed in turn in
-every round. The last columns compare them, and say how far apart their results are, relative to the
-largest number.
+Each runs for as many instances as in its report and for 256, by `jax.vmap`, unless
+`--num-instances` names others. Both ways are timed in turn in every round. A time is that of the
+shortest call of a round, and the median of all rounds: other programs on the machine change it
+little. `ratio` is the time of XLA divided by that of the kernel, and `difference` how far apart
+their results are, relative to the largest number.
+
+For a single instance, `bound` is a time that no program goes below: a call that does nothing, and
+the longest chain of operations that need one another (`longest_chain.py` says what it assumes).
+XLA's time divided by it is the largest ratio that is possible, `at most`.
+
+Each program is measured in a process of its own, which `--limit` ends: XLA may wait for itself for
+ever, where LAPACK's functions take all of its threads.
 """
 
 import argparse
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,8 +40,10 @@ from jaxtyping import Array, Float, Int, PyTree
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from benchmarks.harness.results import check_output, write
+from benchmarks.harness.processes import last_within
+from benchmarks.harness.results import check_output, counts, write
 from benchmarks.harness.timing import available_cores, warm_up
+from benchmarks.throughput.longest_chain import lower_bound, measure_times
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.run_dir import versions
@@ -272,20 +283,22 @@ PROGRAMS = {
 
 
 class Row(NamedTuple):
-    """A `Row` holds the times of one program."""
+    """A `Row` holds the times of one program; None: not measured."""
 
     program: str
     report: str
     num_instances: int
-    kernel_seconds: float | None
-    """Median time of a call; None: it is no kernel."""
-    xla_seconds: float
-    kernel_compile_seconds: float | None
-    xla_compile_seconds: float
-    difference: float | None
+    kernel_seconds: float | None = None
+    """Time of the shortest call of a round, median of the rounds."""
+    xla_seconds: float | None = None
+    bound_seconds: float | None = None
+    """Time that no program goes below, for a single instance."""
+    kernel_compile_seconds: float | None = None
+    xla_compile_seconds: float | None = None
+    difference: float | None = None
     """Largest difference of a result, relative to the largest number of it."""
-    note: str
-    """Why there is no kernel."""
+    note: str = ""
+    """Why there is no kernel, or what took too long."""
 
 
 class Compiled:
@@ -303,6 +316,10 @@ class Compiled:
         """Return the time of a call [s] in one round."""
         return self._time_calls(self._calls) / self._calls
 
+    def shortest(self) -> float:
+        """Return the time of the shortest call in one round [s]."""
+        return min(self._time_calls(1) for _ in range(self._calls))
+
     def results(self) -> list[np.ndarray]:
         """Return the leaves of the result, in float64."""
         leaves = jax.tree.leaves(self._program(self._argument))
@@ -315,67 +332,93 @@ class Compiled:
         return time.perf_counter() - start
 
 
-def measure(name: str, num_instances: int | None, rounds: int) -> Row:
+def measure(name: str, num_instances: int, rounds: int) -> Iterator[Row]:
     """Time a program both ways.
 
     Args:
       name: a key of `PROGRAMS`.
-      num_instances: number of instances; 1: without `jax.vmap`; None: that of the report.
+      num_instances: number of instances; 1: without `jax.vmap`.
       rounds: number of rounds, in each of which both are timed once.
+
+    Yields:
+      The row, without what XLA takes and then with it.
     """
-    function, shape, report, draw, reported = PROGRAMS[name]
-    num_instances = num_instances or reported
-    rng = np.random.default_rng(0)
-    if num_instances == 1:
-        argument, batch = jnp.asarray(draw(rng, shape)), lambda f: f
-    else:
-        argument, batch = jnp.asarray(draw(rng, (num_instances, *shape))), jax.vmap
-    xla, kernel, note = Compiled(batch(function), argument), None, ""
+    function, shape, report, draw, _ = PROGRAMS[name]
+    rng, is_one = np.random.default_rng(0), num_instances == 1
+    argument = jnp.asarray(draw(rng, shape if is_one else (num_instances, *shape)))
+    batch = (lambda f: f) if is_one else jax.vmap
+    row, kernel = Row(name, f"https://github.com/{report}", num_instances), None
     try:
         kernel = Compiled(batch(fuse(function, on_unsupported="raise")), argument)
+        row = row._replace(
+            kernel_seconds=statistics.median(kernel.shortest() for _ in range(rounds)),
+            kernel_compile_seconds=kernel.compile_seconds,
+            bound_seconds=lower_bound(function, argument, measure_times()) if is_one else None,
+        )
     except UnsupportedError as error:
-        note = str(error)
+        row = row._replace(note=str(error))
+    yield row
+    xla = Compiled(batch(function), argument)
     times: dict[str, list[float]] = {"xla": [], "kernel": []}
     for _ in range(rounds):
-        times["xla"].append(xla.repeat())
+        times["xla"].append(xla.shortest())
         if kernel:
-            times["kernel"].append(kernel.repeat())
-    difference = None
+            times["kernel"].append(kernel.shortest())
+    row = row._replace(
+        xla_seconds=statistics.median(times["xla"]), xla_compile_seconds=xla.compile_seconds
+    )
     if kernel:
         pairs = zip(kernel.results(), xla.results(), strict=True)
-        difference = max(float(np.abs(a - b).max() / max(np.abs(b).max(), 1e-12)) for a, b in pairs)
-    return Row(
-        name,
-        f"https://github.com/{report}",
-        num_instances,
-        statistics.median(times["kernel"]) if kernel else None,
-        statistics.median(times["xla"]),
-        kernel.compile_seconds if kernel else None,
-        xla.compile_seconds,
-        difference,
-        note,
-    )
+        row = row._replace(
+            kernel_seconds=statistics.median(times["kernel"]),
+            difference=max(
+                float(np.abs(a - b).max() / max(np.abs(b).max(), 1e-12)) for a, b in pairs
+            ),
+        )
+    yield row
+
+
+def measure_within(limit: float, name: str, num_instances: int, rounds: int) -> Row:
+    """Return the row of `measure`, or what there is of it after so many seconds.
+
+    Raises:
+      UserError: the process that measures failed.
+    """
+    row, is_complete = last_within(limit, measure, name, num_instances, rounds)
+    if row is None:
+        row = Row(name, f"https://github.com/{PROGRAMS[name].report}", num_instances)
+    if is_complete:
+        return row
+    is_begun = row.kernel_seconds is not None or row.note
+    late = f"{'XLA' if is_begun else 'the kernel'}: not within {limit:g} s"
+    return row._replace(note="; ".join(filter(None, (row.note, late))))
 
 
 _HEAD = (
-    f"{'program':26}{'instances':>10}{'kernel':>12}{'XLA':>12}{'ratio':>8}"
-    f"{'compiled in':>13}{'XLA':>8}{'difference':>12}"
+    f"{'program':26}{'instances':>10}{'kernel':>13}{'XLA':>13}{'ratio':>8}{'bound':>12}"
+    f"{'at most':>9}{'compiled in':>13}{'XLA':>8}{'difference':>12}"
 )
 
 
 def table_line(row: Row) -> str:
     """Return a row of the printed table."""
-    xla = f"{1e6 * row.xla_seconds:,.1f} us"
-    compiled = f"{row.xla_compile_seconds:.1f} s"
-    if row.kernel_seconds is None:
-        return (
-            f"{row.program:26}{row.num_instances:10,}{'-':>12}{xla:>12}{'':8}{'':13}{compiled:>8}"
-            f"  {row.note}"
-        )
+
+    def text(x: float | None, form: str, unit: str = "") -> str:
+        return "-" if x is None else f"{x:{form}}{unit}"
+
+    def microseconds(x: float | None) -> str:
+        return text(None if x is None else 1e6 * x, ",.1f", " us")
+
+    def ratio(to: float | None) -> str:
+        return text(row.xla_seconds / to if row.xla_seconds and to else None, ".1f")
+
+    kernel, xla, bound = row.kernel_seconds, row.xla_seconds, row.bound_seconds
     return (
-        f"{row.program:26}{row.num_instances:10,}{f'{1e6 * row.kernel_seconds:,.1f} us':>12}"
-        f"{xla:>12}{row.xla_seconds / row.kernel_seconds:8.1f}"
-        f"{f'{row.kernel_compile_seconds:.1f} s':>13}{compiled:>8}{row.difference:12.0e}"
+        f"{row.program:26}{row.num_instances:10,}{microseconds(kernel):>13}{microseconds(xla):>13}"
+        f"{ratio(kernel):>8}{microseconds(bound):>12}{ratio(bound):>9}"
+        f"{text(row.kernel_compile_seconds, '.1f', ' s'):>13}"
+        f"{text(row.xla_compile_seconds, '.1f', ' s'):>8}{text(row.difference, '.0e'):>12}"
+        f"{'  ' + row.note if row.note else ''}"
     )
 
 
@@ -394,9 +437,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "programs", nargs="*", default=names, metavar="NAME", help=f"of {', '.join(names)}"
     )
     parser.add_argument(
-        "--num-instances", type=cli.positive_int, help="without it: as many as in the report"
+        "--num-instances",
+        type=counts,
+        metavar="N[,N...]",
+        help="(default: as many as in the report, and 256)",
     )
     parser.add_argument("--rounds", type=cli.positive_int, default=5)
+    parser.add_argument(
+        "--limit",
+        type=cli.positive_int,
+        default=180,
+        metavar="SECONDS",
+        help="the longest time to measure a program (default: 180)",
+    )
     parser.add_argument("--output", type=Path, help="a JSON file for the results")
     options = parser.parse_args(arguments)
     for name in options.programs:
@@ -409,8 +462,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(_HEAD)
     rows = []
     for name in options.programs:
-        rows.append(measure(name, options.num_instances, options.rounds))
-        print(table_line(rows[-1]), flush=True)
+        for count in options.num_instances or (PROGRAMS[name].num_instances, 256):
+            rows.append(measure_within(options.limit, name, count, options.rounds))
+            print(table_line(rows[-1]), flush=True)
     if options.output:
         about = {"device": device.device_kind, "cpu_cores": available_cores()}
         about |= {"versions": versions(), "rows": [row._asdict() for row in rows]}

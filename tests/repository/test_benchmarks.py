@@ -1,11 +1,14 @@
 """The benchmarks: help texts, comparison with earlier files, kernel counts, tables and plots."""
 
+import argparse
 import importlib
+import itertools
 import json
 import os
 import re
 import runpy
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -15,11 +18,11 @@ import pytest
 import scipy.stats
 
 from benchmarks import RESULTS, ROOT, steps_per_second
-from benchmarks.harness import readme_table, results, timing
+from benchmarks.harness import processes, readme_table, results, timing
 from benchmarks.harness.measurements import Sizes
 from benchmarks.harness.timing import make_row
 from benchmarks.learning import randomization
-from benchmarks.reliability import regressions
+from benchmarks.reliability import regressions, robot_fidelity
 from benchmarks.throughput import (
     adapters,
     baselines,
@@ -27,13 +30,14 @@ from benchmarks.throughput import (
     ensembles,
     fuse,
     kernels,
+    longest_chain,
     one_robot,
     programs,
     randomization_cost,
     rate_plots,
 )
 from helpers.gliding import everywhere
-from jetbot_mjx.config import parse_config
+from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
 from onekernel import cpu, gpu
@@ -502,13 +506,86 @@ def test_mujocos_batch_and_rollout_start_from_the_same_states():
 @pytest.mark.parametrize("name", ["small_solves", "search"])
 def test_a_program_is_the_same_as_one_kernel_and_by_xla(name, capsys, monkeypatch):
     monkeypatch.setattr(timing, "REPEAT_SECONDS", 0.01)
-    assert programs.main([name, "--num-instances", "3", "--rounds", "1"]) == 0
-    assert name in capsys.readouterr().out
-    row = programs.measure(name, 1, 1)
+    assert programs.main([name, "--num-instances", "3,1", "--rounds", "1"]) == 0
+    assert capsys.readouterr().out.count(name) == 2
+    early, row = programs.measure(name, 1, 1)
+    assert early.xla_seconds is None
+    assert early.kernel_seconds > 0
     assert row.difference < 1e-6
-    assert row.kernel_seconds > 0
     with pytest.raises(UserError, match="there is no program nothing: choose of"):
         programs.main(["nothing"])
+
+
+@pytest.mark.parametrize(
+    "name", ["quasiseparable_cholesky", "search", pytest.param("orbits", marks=pytest.mark.slow)]
+)
+def test_no_program_is_faster_than_its_bound(name, monkeypatch):
+    monkeypatch.setattr(timing, "REPEAT_SECONDS", 0.05)
+    *_, row = programs.measure(name, 1, 1)
+    assert 1e-6 < row.bound_seconds < min(row.kernel_seconds, row.xla_seconds)
+
+
+def halve_until_below_one(x):
+    return jax.lax.while_loop(lambda x: x >= 1, lambda x: x / 2, x)
+
+
+BOUNDS = {
+    "a product and a sum are one instruction": (lambda x: x * x + 1, 5),
+    "a sum of two sums": (lambda x: (x + 1) + (x + 2), 2),
+    "apart, where that is earlier": (lambda x: (x + 1) * (x + 2) + jnp.sqrt(jnp.sqrt(x)), 201),
+    "iterations wait for the carry": (
+        lambda x: jax.lax.fori_loop(0, 500, lambda i, y: 1.0 / (y + x), x),
+        500 * 21,
+    ),
+    "but not for what follows from the counter": (
+        lambda x: jax.lax.scan(lambda y, i: (y + 1.0 / (2 + i), y), x, jnp.arange(500.0))[0],
+        500 + 21,
+    ),
+    "a stored number is there when it was computed": (
+        lambda x: jax.lax.scan(lambda y, _: (y + x, y), x, length=500)[1][20],
+        20,
+    ),
+    "the iterations that are made": (halve_until_below_one, 4 * 10),
+    "the selected number": (lambda x: jnp.where(x > 0, x + 1, jnp.sqrt(x)), 1),
+    "the side that is taken": (
+        lambda x: jax.lax.cond(x > 0, lambda x: x + 1, halve_until_below_one, x),
+        1,
+    ),
+    "the larger number": (lambda x: jnp.maximum(x + 20, jnp.sqrt(x)), 1),
+    "whole numbers": (lambda x: x.astype(jnp.int32) + 1, 3),
+}
+
+
+@pytest.mark.parametrize("what", BOUNDS)
+def test_a_bound_is_the_longest_chain(what):
+    function, seconds = BOUNDS[what]
+    times = {"add": 1, "mul": 10, "fma": 5, "div": 20, "sqrt": 100, "round": 40, "count": 6}
+    found = longest_chain.lower_bound(function, jnp.float32(9.0), {**times, "call": 10_000})
+    assert found == 10_000 + seconds
+
+
+def test_a_process_is_ended_after_its_time():
+    assert processes.last_within(60, range, 3) == (2, True)
+    assert processes.last_within(0.1, range, 3) == (None, False)
+    with pytest.raises(UserError, match=r"the process of int\(seven\) failed"):
+        processes.last_within(60, int, "seven")
+
+
+@pytest.mark.slow
+def test_what_a_process_yields_before_its_time_is_kept():
+    # It passes on a number after so many seconds.
+    given = itertools.filterfalse, time.sleep, [0.001, 1000]
+    assert processes.last_within(30, *given) == (0.001, False)
+
+
+def test_a_row_says_what_took_too_long(monkeypatch):
+    row = programs.Row("search", "https://github.com/jax-ml/jax/issues/25190", 1)
+    found = iter([(None, False), (row._replace(kernel_seconds=1e-6), False)])
+    monkeypatch.setattr(programs, "last_within", lambda *_: next(found))
+    assert programs.measure_within(9, "search", 1, 1).note == "the kernel: not within 9 s"
+    late = programs.measure_within(9, "search", 1, 1)
+    assert late.note == "XLA: not within 9 s"
+    assert programs.table_line(late).split()[:4] == ["search", "1", "1.0", "us"]
 
 
 def test_an_ensemble_is_solved_alike_as_one_kernel_and_by_xla(tmp_path, monkeypatch, capsys):
@@ -525,3 +602,33 @@ def test_an_ensemble_is_solved_alike_as_one_kernel_and_by_xla(tmp_path, monkeypa
     assert max(kernel["median_error"], xla["median_error"]) < 1e-3
     with pytest.raises(UserError, match=r"--tolerance 0\.0: name a number from 1e-7 to 1"):
         ensembles.main(["--tolerance", "0"])
+
+
+@pytest.mark.parametrize("friction", [None, 0.2])
+def test_robots_are_compared_with_c_mujoco_under_the_same_commands(friction, monkeypatch):
+    env = robot_fidelity.make_env(load_config("turtlebot")).blind()
+    options = argparse.Namespace(robots=4, seconds=0.5, seed=0)
+    row = robot_fidelity.measure("turtlebot", env, friction, options)
+    assert row.is_right
+    assert row.worst < 1e-2
+    assert row.driven > 10.0  # mm
+    # It does not hold by itself: MJX on ice, and C MuJoCo on the floor of the model.
+    ours, model = robot_fidelity.make_slippery(env, 0.01)
+    monkeypatch.setattr(robot_fidelity, "make_slippery", lambda *_: (ours, env.physics.mj_model))
+    assert not robot_fidelity.measure("turtlebot", env, friction, options).is_right
+    assert model.geom_friction[:, 0].max() == 0.01
+
+
+@pytest.mark.parametrize(
+    ("changed", "right"),
+    [
+        ({}, True),
+        ({"median": 0.06}, False),
+        ({"p99": 2.1}, False),
+        ({"far": ((5.0, 4.0),)}, True),
+        ({"far": ((5.0, 4.0), (5.0, 2.0))}, False),
+    ],
+)
+def test_robots_that_end_far_away_have_to_be_explained(changed, right):
+    row = robot_fidelity.Row("one", None, 0.01, 0.1, 1.0, 500.0, ())
+    assert row._replace(**changed).is_right is right
