@@ -245,6 +245,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
                 "cpu_cores": available_cores(),
                 "load_before": load_before,
+                "nice": os.nice(0),
                 "run": Path(run).name,
                 "versions": versions(),
                 "canvas": SIZE,

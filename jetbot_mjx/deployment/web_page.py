@@ -92,11 +92,12 @@ def write_web_page(
 
 def summarize_web_page(page: WebPage) -> str:
     """Return what was written as lines for the terminal."""
-    trains = "can be trained there" if page.no_learner is None else page.no_learner
-    reason = "" if page.no_learner is None else "no training in the page: "
+    reason = page.no_learner
+    none = f"no training there, which needs the fused update: {reason}"
+    trains = "can be trained there" if reason is None else none
     return (
         f"{runs.shortened(page.path)}, {page.size / 1e6:.2f} MB, opens in any browser\n"
-        f"  drivers: {', '.join(page.drivers)}; {reason}{trains}"
+        f"  drivers: {', '.join(page.drivers)}; {trains}"
     )
 
 

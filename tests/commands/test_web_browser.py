@@ -126,6 +126,31 @@ def test_a_page_works_under_a_strict_policy_of_its_server(browser, page):
     assert browser.errors == []
 
 
+PACE = """
+(() => {
+  const { simulation } = jetbot.app, { meta } = simulation.data, paces = [];
+  // Steps of 0.05 s with 60 frames a second, and those of every frame that take too long.
+  for (const [dt, rate, milliseconds] of [[0.05, 1, 0], [1 / 60, 4, 15]]) {
+    meta.dt = dt;
+    Object.assign(simulation, { rate, paused: false, backlog: 0, lately: { made: 0, wanted: 0 } });
+    simulation.step = () => {
+      const end = performance.now() + milliseconds;
+      while (performance.now() < end);
+    };
+    for (let frame = 0; frame < 90; frame++) simulation.advance(1 / 60);
+    paces.push(simulation.pace);
+  }
+  return paces;
+})()
+"""
+
+
+def test_the_pace_is_told_where_it_is_slow(open_page):
+    in_time, slow = open_page(1280, 720).run(PACE)
+    assert in_time > 0.95
+    assert slow < 0.8
+
+
 TOUCH = """
 (() => {
   const { simulation } = jetbot.app, { fleet } = simulation, robots = [0, 1];

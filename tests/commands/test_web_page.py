@@ -187,7 +187,8 @@ def test_why_a_page_cannot_train_is_told(here, capfd, monkeypatch):
     }
     monkeypatch.setattr(web_page, "page_data", lambda _: data)
     assert export.main(["pretrained:jetbot_camera", "--format", "web"]) == 0
-    assert "no training in the page: it takes no images" in capfd.readouterr().out
+    told = capfd.readouterr().out
+    assert "no training there, which needs the fused update: it takes no images" in told
 
 
 @pytest.mark.usefixtures("quick")

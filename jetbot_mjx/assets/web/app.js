@@ -4,6 +4,7 @@ const COUNTS = [1, 16, 64, 256, 1024], FIRST_COUNT = 16;
 const RATES = [[0.25, "¼×"], [1, "1×"], [4, "4×"]];
 const FLEET_SEED = 1;
 const STEP_BUDGET = 22; // milliseconds of a frame that may go into steps
+const KEPT = 0.98; // share of the frames before in what is told of the pace
 const PANEL_SECONDS = 0.12; // between two updates of the numbers
 const AIM = 0.95; // the dashed line of the curve
 const PUSH_SPEED = 1.2; // m/s
@@ -41,7 +42,7 @@ function shortCount(count) {
 /** Robots in real time, with whoever drives them. */
 class Simulation {
   constructor(engine, data, scene) {
-    Object.assign(this, { engine, data, scene, rate: 1, paused: reducedMotion, backlog: 0, chosen: 0, pace: 1 });
+    Object.assign(this, { engine, data, scene, rate: 1, paused: reducedMotion, backlog: 0, chosen: 0, lately: { made: 0, wanted: 0 } });
     this.policies = data.policies.map(policyOf);
     this.driver = { kind: "policy", index: this.policies.length - 1 };
     this.learned = null; // the newest policy of a training
@@ -137,7 +138,13 @@ class Simulation {
       this.backlog = Math.min(this.backlog, dt);
       break;
     }
-    if (wanted > 0) this.pace += 0.04 * (Math.min(1, made / wanted) - this.pace);
+    this.lately = { made: KEPT * this.lately.made + made, wanted: KEPT * this.lately.wanted + wanted };
+  }
+
+  /** How much of the time that should have passed lately has passed, up to 1. */
+  get pace() {
+    const { made, wanted } = this.lately;
+    return wanted > 0 ? Math.min(1, made / wanted) : 1;
   }
 
   step() {
@@ -479,7 +486,7 @@ class TrainPanel {
     byId("curve").setAttribute("hidden", "");
     byId("no-learner").hidden = reason === null;
     byId("train").open = reason === null;
-    if (reason !== null) return write(byId("no-learner"), `Not in this page: ${reason}`);
+    if (reason !== null) return write(byId("no-learner"), `No training here, which needs the fused update: ${reason}.`);
     this.curve = new Curve(byId("curve"));
     byId("train").addEventListener("toggle", () => this.curve.draw());
     byId("start").addEventListener("click", () => this.#toggle());
@@ -760,7 +767,7 @@ class App {
 
   #frame(now) {
     requestAnimationFrame((next) => this.#frame(next));
-    const { frames, simulation, scene } = this, seconds = frames.last ? Math.min(0.1, (now - frames.last) / 1000) : 0;
+    const { frames, simulation, scene } = this, seconds = frames.last ? Math.min(0.25, (now - frames.last) / 1000) : 0;
     this.#measure(now);
     this.hand.update(seconds);
     simulation.advance(seconds);
