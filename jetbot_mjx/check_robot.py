@@ -55,9 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     with startup.exit_on_interrupt():
-        from jetbot_mjx.envs import describe_robot, make_env
+        from jetbot_mjx.envs import describe_robot, make_jetbot_env
     cli.prepare_device()
-    env = make_env(_config(options.file, options.overrides))
+    env = make_jetbot_env(_config(options.file, options.overrides))
     for label, text in describe_robot(env):
         cli.tell(f"{label:10} {text}")
     _tell_cost(env)

@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f" up to there:\n{NAN_DUMP_HEADER}"
     )
     nonfinite: list[str] = []
-    env = make_env(stored.config.for_any_device(), task_class=stored.task_class)
+    env = make_env(stored.config.for_any_device(), own_class=stored.own_class)
     for index, step in enumerate(replay_nan_dump(stored, env)):
         cli.tell(format_step(index, step))
         nonfinite = step.nonfinite

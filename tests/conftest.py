@@ -63,7 +63,8 @@ from helpers.unpainted import unpainted
 from jetbot_mjx import fallbacks
 from jetbot_mjx.config import Config, ConfigError, load_config, parse_config, task_modules
 from jetbot_mjx.envs import opengl, program_key
-from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.build import make_env
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.errors import UserError
 
 _OWN_TASKS = program_key.BUILT_IN_TASKS

@@ -7,7 +7,7 @@ import pytest
 from jetbot_mjx import fallbacks
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import physics
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.task import GoalTask
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.fallbacks import Fallback, collect, report

@@ -27,7 +27,7 @@ from benchmarks.harness.timing import (
 )
 from jetbot_mjx.agents.networks import init_normalizer, make_networks
 from jetbot_mjx.config import Config, parse_config
-from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_jetbot_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import Setup
@@ -61,7 +61,7 @@ def _measure_physics(timed: TimedProgram, sizes: Sizes) -> Row:
 
 def prepare_physics(config: Config, num_envs: int, sizes: Sizes) -> TimedProgram:
     """Compile the physics alone, under random actions in every step."""
-    env = make_env(config)
+    env = make_jetbot_env(config)
 
     def step(carry: Carry) -> Carry:
         key, actions = random_actions(carry.key, num_envs)
@@ -84,7 +84,7 @@ def measure_switched(config: Config, num_envs: int, sizes: Sizes) -> Row:
 
     Each robot holds every command for a fixed number of steps, drawn from 1 to 24.
     """
-    env = make_env(config)
+    env = make_jetbot_env(config)
     robots = env_keys(num_envs)
     holds = jax.vmap(lambda key: jax.random.randint(key, (), 1, _LONGEST_HOLD + 1))(robots)
 
@@ -106,7 +106,7 @@ def measure_switched(config: Config, num_envs: int, sizes: Sizes) -> Row:
 
 def prepare_env(config: Config, num_envs: int, sizes: Sizes) -> TimedProgram:
     """Compile the environment with the training wrappers, under random actions."""
-    env = make_env(config)
+    env = make_jetbot_env(config)
     batch = wrap_for_training(env, config.task.episode_length)
 
     def step(carry: Carry) -> Carry:
@@ -128,7 +128,7 @@ def measure_env(config: Config, num_envs: int, sizes: Sizes) -> Row:
 
 def measure_rollout(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Time Brax's `generate_unroll` with untrained networks of the configured sizes."""
-    env = make_env(config)
+    env = make_jetbot_env(config)
     batch = wrap_for_training(env, config.task.episode_length)
     policy = _exploring_policy(config, env)
     fields = ("truncation", "episode_metrics", "episode_done")

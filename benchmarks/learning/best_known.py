@@ -34,7 +34,7 @@ from benchmarks.harness.results import check_output
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.devices import require_device, use_compilation_cache
-from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_jetbot_env
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.best_known import FILE, FORMAT, settings_of
@@ -284,7 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     read(options.output)
     settings = Settings(*(getattr(options, name) for name in Settings._fields))
     chunk = options.chunk or (8 if jax.default_backend() == "cpu" else 1024)
-    env = make_env(config)
+    env = make_jetbot_env(config)
     best, baseline = run(env, settings, options.goals, min(chunk, options.goals))
     for name, steps in (("best known", best.steps), ("scripted", baseline.steps)):
         seconds = steps * env.dt

@@ -68,7 +68,7 @@ from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.config import Config, RobotConfig, load_config, parse_config
 from jetbot_mjx.devices import compiler_options, require_device, use_compilation_cache
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_jetbot_env
 from jetbot_mjx.envs.physics import Physics
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QVEL_ANGULAR_B, QVEL_LINEAR_W
 from jetbot_mjx.envs.state import PhysicsState
@@ -367,9 +367,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     values["ppo"] |= ADAPTIVE_KL if config.ppo.learning_rate_schedule == "LINEAR" else {}
     values["ppo"]["normalizer"] = "brax"
     config = parse_config(values)
-    probe_env = make_env(probe)
+    probe_env = make_jetbot_env(probe)
     probe_env = probe_env.with_physics(Unicycle(probe_env.physics.mj_model, probe.physics))
-    tasks = {"probe": (probe, probe_env), options.config.name: (config, make_env(config))}
+    tasks = {"probe": (probe, probe_env), options.config.name: (config, make_jetbot_env(config))}
     for trainer in TRAINERS:
         _with_trainer(config, trainer, config.seed).check_devices(jax.device_count())
     # Train and compare on each task.

@@ -53,7 +53,7 @@ class PolicyEvaluator:
           goals: The number of the report's goals for each robot of the robustness evaluation.
         """
         setup = Setup(config)
-        env, networks, programs = setup.env, setup.networks, setup.programs
+        env, networks, programs = setup.robot_env, setup.networks, setup.programs
         self._dt, self._keys = env.dt, report_keys(episodes)
         self._evaluators = {
             "preset": Evaluator(env, networks, programs),

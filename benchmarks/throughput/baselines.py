@@ -32,7 +32,7 @@ from benchmarks.harness.timing import (
 )
 from benchmarks.throughput.one_robot import OneRobot, make_physics_model, wheel_targets
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.jetbot_env import make_jetbot_env
 from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.errors import UserError
 
@@ -205,7 +205,7 @@ def prepare_warp(config: Config, num_envs: int, sizes: Sizes) -> TimedProgram:
     # Build Warp's model and data; its messages about loaded kernels and overflows are disabled.
     warp = importlib.import_module("warp")
     warp.config.log_level = warp.LOG_WARNING
-    env, model = make_env(config), make_physics_model(config)
+    env, model = make_jetbot_env(config), make_physics_model(config)
     n_substeps = config.physics.n_substeps
     sizes_in_mjx = mjx.make_data(model)._impl
     warp_model = mjx.put_model(model, impl="warp")

@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks.harness.timing import available_cores
 from jetbot_mjx.config import CameraConfig, Config
 from jetbot_mjx.envs.camera.render import Camera
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.jetbot_env import make_jetbot_env
 from jetbot_mjx.runs.run_dir import versions, write_json
 
 REPEATS = 9
@@ -106,7 +106,10 @@ def draw_poses(count: int) -> Poses:
 
 def scenes() -> dict[str, mujoco.MjModel]:
     """Return the models of the scenes, by name."""
-    return {"task": make_env(Config()).mj_model, "eight": mujoco.MjModel.from_xml_string(_EIGHT)}
+    return {
+        "task": make_jetbot_env(Config()).mj_model,
+        "eight": mujoco.MjModel.from_xml_string(_EIGHT),
+    }
 
 
 def _rate(run: Callable[[], Any], count: int) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from jetbot_mjx import cli
 from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.config import Config, load_config, parse_config
 from jetbot_mjx.devices import compiler_options
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.jetbot_env import make_jetbot_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.training.ppo_trainer import build_ppo
@@ -110,7 +110,7 @@ def compiled_text(config: Config, program: str) -> str:
       config: The configuration of the run.
       program: One of `PROGRAMS`.
     """
-    env = make_env(config)
+    env = make_jetbot_env(config)
     batch = wrap_for_training(env, config.task.episode_length)
     keys = jax.random.split(jax.random.PRNGKey(0), config.ppo.num_envs)
     actions = jnp.zeros((config.ppo.num_envs, 2))
@@ -132,7 +132,7 @@ def count_scalars(config: Config) -> dict[str, int]:
     """Count the scalar operations in one physics step of one robot, by their kind."""
     values = config.model_dump(mode="json")
     values["physics"] |= {"impl": "xla", "ctrl_dt": config.physics.sim_dt}
-    env = make_env(parse_config(values))
+    env = make_jetbot_env(parse_config(values))
     physics = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
     program = scalarize(env.physics.step, physics, jnp.zeros(env.action_size))
     return dict(collections.Counter(x.op for x in program.block.values()).most_common())
@@ -155,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     config = load_config(options.config, options.overrides)
     print(
         f"{options.config.name} with {config.ppo.num_envs} environments on"
-        f" {jax.devices()[0].device_kind}, physics.impl {make_env(config).physics.impl}"
+        f" {jax.devices()[0].device_kind}, physics.impl {make_jetbot_env(config).physics.impl}"
     )
     for program in PROGRAMS:
         if program not in options.skip:

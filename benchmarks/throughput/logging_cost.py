@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks.harness.measurements import IntervalTimer
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.jetbot_env import make_jetbot_env
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.metrics import CompileClock
@@ -88,7 +88,7 @@ def measure(config: Config, repeats: int) -> dict[str, list[float]]:
     Returns:
       The seconds of each training from its first report until its last is written, by mode.
     """
-    env = make_env(config)
+    env = make_jetbot_env(config)
     program = ppo_trainer.CompiledTrainer.from_setup(Setup(config, env=env))
     compiled = program.compile()
     program.compile = lambda: compiled

@@ -12,7 +12,7 @@ from jetbot_mjx.adapters.arguments import ResetKeys, Seed, as_actions
 from jetbot_mjx.adapters.renderer import Pose
 from jetbot_mjx.config import Config
 from jetbot_mjx.devices import compiler_options
-from jetbot_mjx.envs import State, make_env, wrap_for_training
+from jetbot_mjx.envs import State, make_jetbot_env, wrap_for_training
 from jetbot_mjx.errors import check_count
 
 Observations = Float[np.ndarray, "n obs"] | UInt8[np.ndarray, "n h w c"] | dict[str, np.ndarray]
@@ -73,7 +73,7 @@ class BatchedEnv:
         check_count("num_envs", num_envs, _MOST_ENVS)
         self.num_envs = int(num_envs)
         self._reset_keys = ResetKeys(seed, self.num_envs)
-        self.env = make_env(config)
+        self.env = make_jetbot_env(config)
         length = config.task.episode_length
         wrapped = wrap_for_training(self.env, length, final_images=True)
         options = compiler_options(config.deterministic)

@@ -97,13 +97,16 @@ def network_factory(config: NetworkConfig) -> Callable[..., Any]:
     """
     from brax.training.agents.ppo import networks as ppo_networks
 
+    kind = config.distribution_type
     make = functools.partial(
         ppo_networks.make_ppo_networks,
         policy_hidden_layer_sizes=config.policy_hidden_layer_sizes,
         value_hidden_layer_sizes=config.value_hidden_layer_sizes,
         activation=_ACTIVATIONS[config.activation],
-        distribution_type=config.distribution_type,
+        distribution_type="tanh_normal" if kind == "categorical" else kind,
     )
+    if kind == "categorical":
+        return functools.partial(_choosing, config, make)
     if config.initial_action is None:
         return make
     action = config.initial_action
@@ -122,6 +125,30 @@ def network_factory(config: NetworkConfig) -> Callable[..., Any]:
         )
 
     return make_biased
+
+
+def _choosing(
+    config: NetworkConfig,
+    make: Callable[..., Any],
+    observation_size: Any,
+    action_size: int,
+    **arguments: Any,
+) -> Any:
+    """Return Brax's networks with a policy whose outputs are those of choices."""
+    from brax.training.networks import make_policy_network
+
+    from jetbot_mjx.agents.categorical import CategoricalDistribution
+
+    distribution = CategoricalDistribution(action_size)
+    policy = make_policy_network(
+        distribution.param_size,
+        observation_size,
+        hidden_layer_sizes=config.policy_hidden_layer_sizes,
+        activation=_ACTIVATIONS[config.activation],
+        **arguments,
+    )
+    networks: Any = make(observation_size, action_size, **arguments)
+    return networks.replace(policy_network=policy, parametric_action_distribution=distribution)
 
 
 def _check_action(action: Sequence[float] | None, action_size: int) -> None:

@@ -112,6 +112,11 @@ class PPO:
             else None
         )
 
+    @property
+    def has_success(self) -> bool:
+        """Return whether the environment tells successes, which the tally counts."""
+        return self._env.has_success
+
     # Before the first step: whether the learner can be used, and the state.
 
     def with_xla(self, reason: str) -> "PPO":

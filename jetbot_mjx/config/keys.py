@@ -62,6 +62,8 @@ def likely_key(location: Sequence[str]) -> str:
     if not sections and key in ALL_KEYS:
         section, _, last = key.rpartition(".")
         return f"write `{last}` below `{section}:`, indented"
+    if len(sections) > 1 and sections[0] != sections[1] in Config.model_fields:
+        return f"{sections[1]} is a section of its own, beside {sections[0]}"
     if likely := keys_meant_by(".".join(location)):
         return f"did you mean {' or '.join(likely)}?"
     section = Config()

@@ -23,7 +23,8 @@ Overrides = Mapping[str, object] | Sequence[str]
 def load_config(config: "str | Path | Config | None", overrides: Overrides = ()) -> Config:
     """Read a configuration, apply overrides, and check the result.
 
-    The module of `task.name` is found beside the file, from now on in the whole process.
+    The module of `task.name` or `environment` is found beside the file, from now on in the whole
+    process.
 
     Args:
       config: the name of a configuration that comes with the package; a YAML file with the settings
@@ -37,8 +38,7 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
     Raises:
       ConfigError: the file or an override cannot be read, or a key is unknown, of the wrong
         type, out of bounds or at odds with another.
-      InvalidError: the task's module is beside the file, and another one of its name was found
-        before.
+      InvalidError: that module is beside the file, and another one of its name was found before.
     """
     file = None
     if isinstance(config, Config):
@@ -77,7 +77,7 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
             f" {resolved.robot.sha256!r}: restore its files, or leave the hash out"
         )
     if file is not None:
-        find_task_beside(file, resolved.task.name.partition(":")[0])
+        find_task_beside(file, resolved.code.partition(":")[0])
     return resolved
 
 
@@ -105,6 +105,11 @@ def _with_robot_of_file(values: Mapping[str, object]) -> Mapping[str, object]:
     own = read_yaml(path, "robot.file")
     if "file" in own:
         raise ConfigError(f"robot.file {path}: file = {shown(own['file'])}: it is one itself")
+    if "robot" in own:
+        raise ConfigError(
+            f"robot.file {path}: it has a section robot, as a configuration has: it should be the"
+            " measures alone, such as wheel_radius: 0.04"
+        )
     camera = own.pop("camera", {})
     measures = parse_config({"robot": own, "camera": camera}, f"robot.file {path}").robot
     defaults = {"robot": measures.model_dump(mode="json"), "camera": camera}

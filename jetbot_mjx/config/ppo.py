@@ -26,8 +26,9 @@ class NetworkConfig(Section):
     """Units of the value function's hidden layers."""
     activation: Literal["tanh", "relu", "elu", "swish"] = "tanh"
     """Activation between the layers."""
-    distribution_type: Literal["normal", "tanh_normal"] = "tanh_normal"
-    """Action distribution; `normal` leaves clipping to the environment, as SB3 does."""
+    distribution_type: Literal["normal", "tanh_normal", "categorical"] = "tanh_normal"
+    """Action distribution; `normal` leaves clipping to the environment, as SB3 does; `categorical`
+    is for an `environment` whose actions are choices."""
     initial_action: InnerAction | None = None
     """Action around which an untrained policy acts, within (-1, 1); null: the zero action. Where
     left and right are as good as each other, as for a camera that sees no cube, a policy that
@@ -40,6 +41,15 @@ class NetworkConfig(Section):
     cnn_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
     """Numbers that the convolutions compute with; parameters and sums are float32. `auto`:
     bfloat16 on GPUs, float32 on CPUs."""
+
+    @model_validator(mode="after")
+    def _choice_has_no_mean(self) -> Self:
+        if self.initial_action is not None and self.distribution_type == "categorical":
+            raise ValueError(
+                f"initial_action = {list(self.initial_action)} is the mean of numbers, and with"
+                " distribution_type = 'categorical' actions are choices: leave it out"
+            )
+        return self
 
 
 class PPOConfig(Section):

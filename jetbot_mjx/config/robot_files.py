@@ -12,6 +12,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from jetbot_mjx.config.errors import ConfigError, ConfigNotFoundError
+from jetbot_mjx.errors import shown
 
 FOLDER = "robot"
 """Folder of a run that holds the files of its robot's model."""
@@ -27,6 +28,11 @@ _URDF = (
     " mujoco.MjSpec.from_file(...), spec.worldbody.first_body().add_freejoint(),"
     " spec.add_actuator(...) for each driven wheel, spec.compile(), and spec.to_xml()"
 )
+
+_NAN = {"nan", "+nan", "-nan"}
+
+_NAMES = ("name", "class", "childclass")
+"""Attributes that give names, of which one may be called `nan`."""
 
 _FOLDERS = {"mesh": "meshdir", "texture": "texturedir", "hfield": "meshdir", "skin": "meshdir"}
 """Attributes of MJCF's `compiler` that name the folders of elements."""
@@ -95,10 +101,23 @@ def _collect(
         raise ConfigError(
             f"robot.file {path}: <{tree.tag}> is not a MuJoCo model: its root should be <mujoco>"
         )
+    _check_numbers(path, tree)
     trees.append(tree)
     for element in tree.iter():
         if element.tag in ("include", "model") and (name := element.get("file")):
             _collect(root / name, root, files, trees)
+
+
+def _check_numbers(path: Path, tree: ElementTree.Element) -> None:
+    """Refuse NaN, which MuJoCo reads as a number, with a warning in a file of its own."""
+    names = {element.get(key) for element in tree.iter() for key in _NAMES}
+    for element in tree.iter():
+        for key, text in element.items():
+            if text not in names and _NAN.intersection(text.lower().split()):
+                raise ConfigError(
+                    f"robot.file {path}: <{element.tag} {key}={shown(text)}> holds NaN: give a"
+                    " number"
+                )
 
 
 def _collect_assets(

@@ -4,7 +4,15 @@ import io
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self, TypeAlias
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Discriminator,
+    Field,
+    JsonValue,
+    Tag,
+    model_validator,
+)
 from ruamel.yaml import YAML
 
 from jetbot_mjx.config.camera import CameraConfig
@@ -17,13 +25,17 @@ from jetbot_mjx.config.robot import RobotConfig
 from jetbot_mjx.config.robot_mjcf import MjcfRobotConfig, is_model
 from jetbot_mjx.config.section import Section
 from jetbot_mjx.config.task import TaskConfig
-from jetbot_mjx.config.value_types import Count, Steps, integral, wandb_project
+from jetbot_mjx.config.task_modules import class_name
+from jetbot_mjx.config.value_types import Count, Steps, Text, finite, integral, wandb_project
 from jetbot_mjx.errors import clipped, shown
 
 BRAX_DEFAULTS: Mapping[str, object] = {
     "ppo": {"normalizer": "brax", "network": {"shared_cnn": False}},
 }
 """Defaults of settings under `trainer: brax` that differ from the others."""
+
+ENVIRONMENT_DEFAULTS: Mapping[str, object] = {"ppo": {"normalizer": "brax"}}
+"""Likewise with an `environment` of one's own, whose observation has no known units."""
 
 
 Setting = bool | int | float | str | list["Setting"] | dict[str, "Setting"] | None
@@ -64,6 +76,16 @@ class Config(Section):
     """[s] time after SIGTERM, SIGHUP or SIGINT within which the process must save and exit."""
     stop_at_success: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] | None = None
     """Training ends at the first evaluation with this success rate; null: never before the end."""
+    stop_at_return: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    """Training ends at the first evaluation with this mean return of an episode, likewise."""
+    environment: Annotated[str, BeforeValidator(class_name)] | None = None
+    """An environment of your own to train in, in place of the robot and its task: a class, or a
+    function that returns one, as `file.py:Class` with a file beside this one, or
+    `package.module:Class`."""
+    environment_options: Annotated[dict[Text, JsonValue], AfterValidator(finite)] = Field(
+        default_factory=dict
+    )
+    """Keyword arguments with which it is called."""
     tensorboard: bool = True
     """Whether to write TensorBoard's event files beside `metrics.jsonl`."""
     wandb: Annotated[str, BeforeValidator(wandb_project)] | None = None
@@ -87,6 +109,47 @@ class Config(Section):
         if isinstance(values, Mapping) and values.get("trainer") == "brax":
             return with_defaults(values, BRAX_DEFAULTS)
         return values
+
+    @model_validator(mode="before")
+    @classmethod
+    def _defaults_for_environment(cls, values: object) -> object:
+        """Default to what needs no units, where an environment of one's own has none."""
+        if isinstance(values, Mapping) and values.get("environment") is not None:
+            return with_defaults(values, ENVIRONMENT_DEFAULTS)
+        return values
+
+    @model_validator(mode="after")
+    def _environment_is_alone(self) -> Self:
+        if self.environment is None:
+            if self.ppo.network.distribution_type == "categorical":
+                raise ValueError(
+                    "ppo.network.distribution_type = 'categorical' is for an environment whose"
+                    " actions are choices, and those of the robot are numbers: choose tanh_normal"
+                )
+            if self.environment_options:
+                raise ValueError(
+                    f"environment_options = {shown(self.environment_options)} are the arguments of"
+                    " an environment, and there is none: set environment, or leave them out"
+                )
+            return self
+        given = f"environment = {shown(self.environment)}"
+        for name in ("task", "robot", "camera", "physics", "randomization"):
+            section: Section = getattr(self, name)
+            for key, field in type(section).model_fields.items():
+                value = getattr(section, key)
+                if value == field.get_default(call_default_factory=True):
+                    continue
+                if f"{name}.{key}" not in ("task.episode_length", "physics.impl"):
+                    raise ValueError(
+                        f"{name}.{key} = {shown(value)} is of the JetBot, which {given} takes the"
+                        " place of: leave it out"
+                    )
+        if self.ppo.normalizer == "physical":
+            raise ValueError(
+                f"ppo.normalizer = 'physical' needs the units of the observation, which {given}"
+                " does not state: set ppo.normalizer: brax, or leave it out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _settings_fit(self) -> Self:
@@ -135,6 +198,11 @@ class Config(Section):
                     f"{other_remedy}"
                 )
         return self
+
+    @property
+    def code(self) -> str:
+        """Return the name of what the policy acts in: environment or task, as `module:Class`."""
+        return self.environment or self.task.name
 
     def for_any_device(self) -> "Config":
         """Return a copy whose `physics.impl` and `camera.impl` are "auto", unless they are `xla`.
@@ -225,6 +293,7 @@ class Config(Section):
 CHANGEABLE_ON_RESUME = (
     "ppo.num_timesteps",
     "stop_at_success",
+    "stop_at_return",
     "checkpoint_interval",
     "checkpoints_to_keep",
     "preemption_notice",

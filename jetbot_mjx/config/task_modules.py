@@ -1,4 +1,4 @@
-"""Find the module of a task of one's own.
+"""Find the module of a task or an environment of one's own.
 
 It is looked for beside the configuration file that names it, then in the current folder, and then
 as Python finds any other.
@@ -10,11 +10,33 @@ import os
 import sys
 from pathlib import Path
 
-from jetbot_mjx.errors import InvalidError
+from jetbot_mjx.errors import InvalidError, shown
 
 TASK_FOLDERS: dict[str, Path] = {}
 """Folders of configuration files beside which a task's module was found, by the module's top-level
 name. They are also in `sys.path`."""
+
+
+def class_name(value: object) -> object:
+    """Return the name of a class as `module:Class`, of one in a file `folder/file.py:Class` too.
+
+    Raises:
+      ValueError: it is neither.
+    """
+    if not isinstance(value, str):
+        return value
+    module, separator, name = value.partition(":")
+    if module.endswith(".py"):
+        module = ".".join(Path(module.removesuffix(".py")).parts)
+    if separator and all(part.isidentifier() for part in (*module.split("."), *name.split("."))):
+        return f"{module}:{name}"
+    # Python itself separates a class from its module by a dot.
+    likely = ":".join(value.rpartition(".")[::2])
+    hint = f", perhaps {likely}" if not separator and likely[0] not in ".:" else ""
+    raise ValueError(
+        f"{shown(value)} is wrong: write file.py:Class, with a file beside the configuration, or"
+        f" package.module:Class{hint}"
+    )
 
 
 def find_task_beside(config: Path, module: str) -> None:

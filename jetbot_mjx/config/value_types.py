@@ -1,10 +1,13 @@
 """Define the types of the settings' values: what pydantic converts, and within which bounds."""
 
-from typing import Annotated
+import json
+from typing import Annotated, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from jetbot_mjx.errors import shown
+
+_Json = TypeVar("_Json")
 
 
 def integral(value: object) -> object:
@@ -30,6 +33,15 @@ def _float32(value: float) -> float:
     """Reject a value that would be infinite in float32."""
     if value > _LARGEST_FLOAT32:
         raise ValueError(f"{value:g} is too large: make it at most {_LARGEST_FLOAT32:.2g}")
+    return value
+
+
+def finite(value: _Json) -> _Json:
+    """Reject nested values in which a number is infinite or NaN, which JSON does not have."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except ValueError:
+        raise ValueError(f"{shown(value)}: all numbers should be finite") from None
     return value
 
 

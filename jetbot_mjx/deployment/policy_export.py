@@ -68,7 +68,7 @@ def export_policy(
     # Load the policy.
     checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
     folder = checkpoint.results_dir / FOLDER if output is None else Path(output)
-    env = checkpoint.make_env()
+    env = checkpoint.make_setup().robot_env
     policy, reference = portable_policy(checkpoint, env), as_jax(checkpoint, env)
     with runs.writing_to(folder):
         if folder.exists() and not (folder / FILE).is_file():

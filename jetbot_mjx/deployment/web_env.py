@@ -31,6 +31,7 @@ from jetbot_mjx.deployment.web_scene import encoded
 from jetbot_mjx.envs import Camera, JetBotEnv, State
 from jetbot_mjx.evaluation import BASELINES
 from jetbot_mjx.packed import pack
+from jetbot_mjx.viewers import move_goal_error
 from onekernel import Kernel, UnsupportedError, fuse
 from onekernel.build import wasm
 
@@ -67,7 +68,7 @@ def web_env(env: JetBotEnv, bodies: Sequence[int]) -> WebEnv:
         "script": _kernel(robot.scripted, robot.words),
         "draw": _kernel(_draw, _KEY),
     }
-    if isinstance(env.task, envs.MovesGoal):
+    if not move_goal_error(env, jax.eval_shape(env.reset, _KEY)):
         kernels["move"] = _kernel(robot.moved, robot.words, _floats(3))
     if env.camera is None:
         return _written("robot_", robot, kernels)
@@ -101,7 +102,7 @@ def _written(prefix: str, robot: "_Robot", others: Mapping[str, Kernel]) -> WebE
     knobs = robot.knobs
     try:
         step = _kernel(robot.step, robot.words, robot.action, _floats(len(KNOBS)))
-    except (UnsupportedError, TypeError):
+    except (UnsupportedError, jax.errors.JAXTypeError):
         # A task may use its settings as plain numbers of Python: then they stay as they are.
         knobs, step = [], _kernel(robot.plain_step, robot.words, robot.action)
     kernels = {"reset": _kernel(robot.reset, _KEY), "step": step, **others}

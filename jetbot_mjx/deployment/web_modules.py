@@ -18,7 +18,7 @@ import jax
 from jetbot_mjx import runs
 from jetbot_mjx.config import load_config
 from jetbot_mjx.deployment.web_functions import web_functions
-from jetbot_mjx.envs import make_env
+from jetbot_mjx.envs import make_jetbot_env
 from onekernel.build import wasm
 
 _POLICIES = ("jetbot_egocentric", "jetbot_camera", "real_jetbot", "camera_real")
@@ -59,7 +59,7 @@ def shipped_texts(name: str) -> Mapping[str, str]:
     comes_with, _, policy = name.rpartition(":")
     path = runs.find_run_config(runs.PRETRAINED / policy) if comes_with else name
     config = load_config(path)
-    return web_functions(config, make_env(config)).texts
+    return web_functions(config, make_jetbot_env(config)).texts
 
 
 def store_modules() -> None:

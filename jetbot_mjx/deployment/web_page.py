@@ -109,7 +109,7 @@ def page_data(checkpoint: Checkpoint) -> dict[str, Any]:
     Raises:
       UserError: the environment cannot be compiled for pages, or the linker is missing.
     """
-    env = checkpoint.make_env()
+    env = checkpoint.make_setup().robot_env
     try:
         functions = web_functions(checkpoint.config, env)
         module = find_module(functions.texts)
@@ -138,7 +138,7 @@ def _about(checkpoint: Checkpoint, env: JetBotEnv) -> dict[str, Any]:
     config, drive = checkpoint.config, env.drive
     task = config.task
     nearest = task.goal_distance_min
-    success = runs.stored_success_rate(checkpoint.run_dir, checkpoint.env_steps)
+    success = runs.stored_score(checkpoint.run_dir, checkpoint.env_steps)
     return {
         "title": checkpoint.run_dir.name,
         "robot": config.robot.label,
@@ -152,7 +152,7 @@ def _about(checkpoint: Checkpoint, env: JetBotEnv) -> dict[str, Any]:
         "max_yaw_rate": getattr(drive, "max_yaw_rate", None),
         "trained": {
             "steps": checkpoint.env_steps,
-            "success": success if success >= 0 else None,
+            "success": success if 0 <= success <= 1 else None,
         },
         "versions": runs.versions(),
     }

@@ -1,3 +1,5 @@
+from .adapted_env import AdaptedEnv as AdaptedEnv
+from .build import make_env as make_env
 from .camera.lens import intrinsics as intrinsics
 from .camera.mujoco_camera import MujocoCamera as MujocoCamera
 from .camera.render import Camera as Camera
@@ -17,7 +19,7 @@ from .drive import DifferentialDrive as DifferentialDrive
 from .drive import Drive as Drive
 from .drive import OwnDrive as OwnDrive
 from .jetbot_env import JetBotEnv as JetBotEnv
-from .jetbot_env import make_env as make_env
+from .jetbot_env import make_jetbot_env as make_jetbot_env
 from .kinematics import to_body as to_body
 from .kinematics import turned as turned
 from .kinematics import yaw as yaw
@@ -34,6 +36,7 @@ from .opengl import SceneRenderer as SceneRenderer
 from .opengl import find_backend as find_backend
 from .program_key import is_built_in as is_built_in
 from .program_key import open_program_cache as open_program_cache
+from .program_key import own_fingerprint as own_fingerprint
 from .robot_facts import describe_robot as describe_robot
 from .robot_facts import step_rate as step_rate
 from .robot_facts import training_hints as training_hints
@@ -42,6 +45,7 @@ from .robot_model import QPOS_XYZ as QPOS_XYZ
 from .robot_model import make_mj_model as make_mj_model
 from .robot_model import mocap_ids as mocap_ids
 from .robot_template import write_robot_template as write_robot_template
+from .state import PhysicsState as PhysicsState
 from .state import State as State
 from .state import robot_state as robot_state
 from .task import GOAL_HEIGHT as GOAL_HEIGHT

@@ -7,7 +7,7 @@ all robots.
 """
 
 import math
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from jetbot_mjx.config import (
 )
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.actuators import ActuatorState, initial_actuator_state, step_actuators
+from jetbot_mjx.envs.adapted_env import AdaptedEnv
 from jetbot_mjx.envs.camera.scene import GOAL
 from jetbot_mjx.envs.camera.surroundings import draw_surroundings
 from jetbot_mjx.envs.camera.timing import CameraState, initial_camera_state, step_camera
@@ -244,7 +245,15 @@ def _at_start_pose(physics: PhysicsState, robot_params: RobotParams) -> PhysicsS
     return physics.replace(qpos=physics.qpos.at[QPOS_XYZ].set(place).at[QPOS_QUAT].set(attitude))
 
 
-def maybe_randomize(env: JetBotEnv) -> JetBotEnv | DomainRandomizationWrapper:
+@overload
+def maybe_randomize(env: JetBotEnv) -> JetBotEnv | DomainRandomizationWrapper: ...
+@overload
+def maybe_randomize(
+    env: JetBotEnv | AdaptedEnv,
+) -> JetBotEnv | AdaptedEnv | DomainRandomizationWrapper: ...
+def maybe_randomize(
+    env: JetBotEnv | AdaptedEnv,
+) -> JetBotEnv | AdaptedEnv | DomainRandomizationWrapper:
     """Apply the `randomization` section of an environment's configuration.
 
     Args:
@@ -254,4 +263,7 @@ def maybe_randomize(env: JetBotEnv) -> JetBotEnv | DomainRandomizationWrapper:
       The wrapped environment, or `env` itself if the configuration randomizes nothing.
     """
     ranges = env.config.randomization
-    return DomainRandomizationWrapper(env, ranges=ranges) if ranges.drawn else env
+    # Only a robot has anything to draw: the configuration refuses ranges for other environments.
+    if isinstance(env, AdaptedEnv) or not ranges.drawn:
+        return env
+    return DomainRandomizationWrapper(env, ranges=ranges)

@@ -22,6 +22,7 @@ from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, numbers_of, observation_shapes, see
 from jetbot_mjx.envs.drive import Drive, jetbot_drive
+from jetbot_mjx.envs.kernel_impl import KernelImpl
 from jetbot_mjx.envs.mjcf_robot import RobotFileError
 from jetbot_mjx.envs.mjcf_wheels import find_drive
 from jetbot_mjx.envs.physics import Physics
@@ -32,6 +33,7 @@ from jetbot_mjx.envs.task import (
     AdvancesGoal,
     Goal,
     GoalTask,
+    Layout,
     RobotState,
     Task,
     TaskClass,
@@ -86,6 +88,11 @@ class JetBotEnv(Env):
         Raises:
           UserError: the task or its scene cannot be built.
         """
+        if config.environment is not None:
+            raise InvalidError(
+                f"environment = {config.environment!r} takes the place of the robot and its task:"
+                " make_env builds it"
+            )
         self.config = config
         self.task: Task = make_task(config.task, task_class)
         self.robot = config.robot
@@ -114,6 +121,8 @@ class JetBotEnv(Env):
                 reason = f"MJX does not support {reason}"
             if isinstance(self.robot, MjcfRobotConfig):
                 raise RobotFileError(self.robot, reason) from None
+            if type(self.task).build_scene is GoalTask.build_scene:
+                raise UserError(f"robot {self.robot.label}: {reason}") from None
             raise UserError(
                 f"task.name = {config.task.name!r}: its scene cannot be simulated: {reason}"
                 f" (jetbot-mjx check-env {config.task.name} says more)"
@@ -385,6 +394,23 @@ class JetBotEnv(Env):
         """Length of the action: drive and turn, unless the robot's drive is a function."""
         return self.drive.action_size
 
+    has_success = True
+
+    @property
+    def layout(self) -> Layout:
+        """The numbers of the observation."""
+        return self.task.layout
+
+    @property
+    def kernel_impl(self) -> KernelImpl:
+        """What computes a step: one kernel, or XLA."""
+        return self.physics.kernel_impl
+
+    @property
+    def may_be_kernel(self) -> bool:
+        """Whether physics may be a kernel, and so the whole step."""
+        return self.physics.may_be_kernel
+
     @property
     def backend(self) -> str:
         """Name of the physics back end, for Brax."""
@@ -426,13 +452,13 @@ def _check_one(name: str, array: object, shape: tuple[int, ...], method: str) ->
     raise InvalidError(f"{name}: expected an array of shape {list(shape)}; got {got}")
 
 
-def make_env(
+def make_jetbot_env(
     config: str | Path | Config,
     overrides: Overrides = (),
     *,
     task_class: TaskClass | None = None,
 ) -> JetBotEnv:
-    """Build the environment that a configuration describes.
+    """Build the environment of a robot and its task, of a configuration without `environment`.
 
     Args:
       config: the configuration, its name or its file, as for `load_config`; the sections robot,

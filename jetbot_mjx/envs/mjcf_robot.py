@@ -22,6 +22,10 @@ _VIEWS = {"chase": ((-0.55, 0.0, 0.40), 30.0, 58.0), "onboard": ((0.031, 0.0, 0.
 _OPTIONS_OF_MODEL = ("integrator", "gravity", "density", "viscosity", "wind", "impratio")
 """Options of MuJoCo that a robot's model decides, beside the flags that disable a part of it."""
 
+_PARTS = {"body": "body", "jnt": "joint", "geom": "geom"}
+
+_LARGEST_MASS = 1000.0  # [kg] of a small robot
+
 _SIZES = ("memory", "njmax", "nconmax", "nstack")
 """Sizes of MuJoCo's memory, of which the scene has its own."""
 
@@ -50,10 +54,33 @@ def load_spec(robot: MjcfRobotConfig) -> mujoco.MjSpec:
         )
     try:
         spec = parse_model(robot.file, files)
-        spec.copy().compile()
+        model = spec.copy().compile()
     except (ValueError, mujoco.FatalError) as error:
         raise RobotFileError(robot, f"MuJoCo refuses it: {error}") from None
+    _check_numbers(robot, model)
     return spec
+
+
+def _check_numbers(robot: MjcfRobotConfig, model: mujoco.MjModel) -> None:
+    """Check that a robot has numbers with which it can be simulated, in the right units."""
+    for name in ("body_mass", "body_inertia", "body_pos", "jnt_pos", "geom_pos", "geom_size"):
+        if not np.isfinite(getattr(model, name)).all():
+            part, _, what = name.partition("_")
+            raise RobotFileError(
+                robot, f"the {what} of a {_PARTS[part]} is infinite: give a finite number"
+            )
+    if (mass := float(model.body_mass.sum())) > _LARGEST_MASS:
+        raise RobotFileError(
+            robot,
+            f"it weighs {mass:,.0f} kg: masses are in kilograms (grams are kilograms × 0.001)",
+        )
+    if not model.opt.gravity[2] < 0.0:
+        gravity = " ".join(f"{x:g}" for x in model.opt.gravity)
+        raise RobotFileError(
+            robot,
+            f"its gravity is ({gravity}), which does not hold it on the floor: (0 0 -9.81) is"
+            " right",
+        )
 
 
 def parse_model(file: str, files: Mapping[str, bytes]) -> mujoco.MjSpec:

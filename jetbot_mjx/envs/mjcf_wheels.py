@@ -79,6 +79,12 @@ def _own_drive(robot: MjcfRobotConfig, model: mujoco.MjModel) -> OwnDrive:
         drive = OwnDrive(getattr(module, name), robot.action_size)
         action = jax.ShapeDtypeStruct((robot.action_size,), jnp.float32)
         shape = jax.eval_shape(drive.controls, action).shape
+    except jax.errors.JAXTypeError as error:
+        raise RobotFileError(
+            robot,
+            f"robot.drive = {robot.drive!r} is not written in JAX ({type(error).__name__}): take"
+            " jax.numpy in place of NumPy, and jnp.where in place of `if`",
+        ) from None
     # It is the user's code: whatever it raises belongs into the one line.
     except (Exception, SystemExit) as error:
         reason = f"{type(error).__name__}: {error}"
@@ -157,21 +163,23 @@ class _Parts:
 
     def limits(self, steered: Sequence[Wheel]) -> Float[np.ndarray, " n"]:
         """Return the largest angle of each steered wheel [rad]."""
-        angles, model = [], self._model
+        limits, model = [], self._model
         for one in steered:
             name = model.actuator(one.actuator).name.removeprefix(PREFIX)
             if not model.actuator_ctrllimited[one.actuator]:
                 raise self._error("steering", f"{name} has no limits: give it a ctrlrange [rad]")
-            angles.append(np.abs(model.actuator_ctrlrange[one.actuator] / one.gain).min())
-        if min(angles) < 0.02 or max(angles) > 1.4:
-            raise self._error(
-                "steering",
-                f"angles of {min(angles):.3g} to {max(angles):.3g} rad: 0.02 to 1.4 are"
-                " right, and a ctrlrange is in radians",
-            )
+            limits.append(np.abs(model.actuator_ctrlrange[one.actuator] / one.gain).min())
         joints = [self._joints.of(one.actuator) for one in steered]
         stops = np.abs(model.jnt_range[joints]).min(axis=1)
-        return np.minimum(angles, np.where(model.jnt_limited[joints], stops, np.inf))
+        angles = np.minimum(limits, np.where(model.jnt_limited[joints], stops, np.inf))
+        if min(angles) < 0.02 or max(limits) > 1.4:
+            raise self._error(
+                "steering",
+                f"angles of {min(angles):.3g} to {max(limits):.3g} rad: 0.02 to 1.4 are"
+                " right; a ctrlrange is in radians, and a joint's range in degrees unless there is"
+                ' <compiler angle="radian"/>',
+            )
+        return angles
 
     def rear(self, driven: Sequence[Wheel], steered: Sequence[Wheel]) -> float:
         """Return how far ahead of the base the wheels are that do not turn to the side [m].
@@ -213,9 +221,8 @@ class _Parts:
         names = [model.actuator(i).name.removeprefix(PREFIX) for i in range(model.nu)]
         if name not in names:
             close = difflib.get_close_matches(name, names, 1)
-            hint = (
-                f"did you mean {close[0]}?" if close else f"there are {', '.join(names) or 'none'}"
-            )
+            told = ", ".join(one or "one without a name" for one in names) or "none"
+            hint = f"did you mean {close[0]}?" if close else f"there are {told}"
             raise self._error(key, f"the model has no actuator {name!r}: {hint}")
         index = names.index(name)
         if model.actuator_trntype[index] != mujoco.mjtTrn.mjTRN_JOINT:
@@ -227,6 +234,9 @@ class _Parts:
             raise self._error(key, f"{name} drives {self._joint_name(joint)}, which is no hinge")
         steers = key.startswith("steering")
         self._check_servo(index, name, key, steers=steers)
+        if model.jnt_limited[joint] and not steers:
+            reason = "has a range: a wheel turns without an end"
+            raise self._error(key, f"{name} drives {self._joint_name(joint)}, which {reason}")
         axis, place = self._joints.axis(joint), self._joints.place(joint)
         along = axis[2 if steers else 1]
         if abs(along) < _PARALLEL:
@@ -244,6 +254,8 @@ class _Parts:
         """Check that an actuator takes a speed or an angle as its control."""
         gain, bias = self._model.actuator_gainprm[index, 0], self._model.actuator_biasprm[index]
         follows = bias[1] if steers else bias[2]
+        if self._model.actuator_gear[index, 0] == 0.0:
+            raise self._error(key, f"{name} has a gear of 0, which moves nothing: leave it out")
         if gain <= 0 or not np.isclose(follows, -gain) or (not steers and bias[1] != 0):
             kind = "<position kp=… ctrlrange=…>" if steers else "<velocity kv=… forcerange=…>"
             what = "an angle" if steers else "a wheel speed"

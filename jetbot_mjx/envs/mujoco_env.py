@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PyTree, UInt8, UInt32
 from jetbot_mjx.config import Config, RobotConfig
 from jetbot_mjx.devices import default_device_cpu
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, see
-from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_jetbot_env
 from jetbot_mjx.envs.state import Obs, PhysicsState, State, robot_state
 from jetbot_mjx.envs.task import AdvancesGoal, Goal, TaskClass, layout_size
 
@@ -189,7 +189,7 @@ def _programs(
       positions of solid bodies). What a task or robot lacks or cannot change is None.
     """
     config = Config.model_validate_json(settings)
-    env = make_env(config, task_class=task_class)
+    env = make_jetbot_env(config, task_class=task_class)
     # Leave non-finite states to `MujocoJetBot`, which counts them.
     model = copy.copy(env.physics.mj_model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

@@ -2,8 +2,8 @@
 
 A traced program depends on the configuration, the model, the source of this package and of its
 compiler and the installed libraries. With all of these in the key, a command loads its programs
-without tracing them. This holds only for the tasks of this package, because the dependencies of any
-other task are unknown.
+without tracing them. What a task or an environment of one's own depends on is unknown: it is traced
+first, and the trace is part of the key.
 """
 
 import functools
@@ -12,6 +12,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -21,6 +22,12 @@ from jetbot_mjx import fallbacks
 from jetbot_mjx.config import Config
 from jetbot_mjx.devices import compiler_options
 from jetbot_mjx.envs.versions import LIBRARIES, installed_version
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from jetbot_mjx.envs.adapted_env import AdaptedEnv
+    from jetbot_mjx.envs.jetbot_env import JetBotEnv
 
 _ROOTS = Path(__file__).parents[1], Path(str(onekernel.__file__)).parent
 """Folders of the packages whose complete source is part of the key."""
@@ -33,6 +40,7 @@ _NOT_IN_PROGRAMS = {
     "seed",
     "init_from",
     "stop_at_success",
+    "stop_at_return",
     "checkpoint_interval",
     "checkpoints_to_keep",
     "preemption_notice",
@@ -50,28 +58,32 @@ def is_built_in(task: str) -> bool:
     return task in BUILT_IN_TASKS
 
 
-def open_program_cache(config: Config, *, keep: bool = True) -> onekernel.ProgramCache:
+def open_program_cache(
+    config: Config, *, keep: bool = True, own: str | None = None
+) -> onekernel.ProgramCache:
     """Open the cache of a configuration's programs.
 
     Args:
       config: the configuration of the run.
       keep: whether to keep the programs in JAX's folder of compiled programs.
+      own: a hash of the environment or task of one's own that the configuration names.
 
     Returns:
-      The cache. It is in memory anyway if there is no such folder, for other tasks than this
-      package's, and if several processes train together.
+      The cache. It is in memory anyway if there is no such folder, for code of one's own without a
+      hash, and if several processes train together.
     """
     folder = jax.config.values["jax_compilation_cache_dir"]
-    kept = keep and folder and is_built_in(config.task.name) and jax.process_count() == 1
+    known = own is not None or is_built_in(config.code)
+    kept = keep and folder and known and jax.process_count() == 1
     return onekernel.ProgramCache(
         compiler_options(config.deterministic),
         Path(folder) if kept else None,
-        _key(config) if kept else "",
+        _key(config, own) if kept else "",
         fallbacks,
     )
 
 
-def _key(config: Config) -> str:
+def _key(config: Config, own: str | None) -> str:
     """Return all that the programs of a configuration depend on, but for the compiler's options."""
     devices = jax.devices()
     settings = {
@@ -82,7 +94,7 @@ def _key(config: Config) -> str:
     parts = [
         config.model_dump(mode="json", exclude=_NOT_IN_PROGRAMS),
         _own_source(*_ROOTS),
-        _model(config),
+        _model(config) if own is None else own,
         sys.version,
         [installed_version(name) for name in LIBRARIES],
         settings,
@@ -96,12 +108,39 @@ def _key(config: Config) -> str:
 def _model(config: Config) -> str:
     """Return a hash of a configuration's MuJoCo model, including the options of its solver."""
     # Import MuJoCo late, so that a mistyped command reports its error at once.
-    import mujoco
-
     from jetbot_mjx.envs import robot_model, task
 
     scene = task.make_task(config.task).build_scene
-    model = robot_model.make_mj_model(config.robot, config.physics, build_scene=scene, visual=False)
+    return _model_hash(
+        robot_model.make_mj_model(config.robot, config.physics, build_scene=scene, visual=False)
+    )
+
+
+def own_fingerprint(env: "JetBotEnv | AdaptedEnv") -> str | None:
+    """Return a hash of an environment, or of a robot's task, of one's own, from its trace.
+
+    Args:
+      env: the environment, unwrapped.
+
+    Returns:
+      The hash; None: the code depends on something that has none, such as a call of Python.
+    """
+    from jetbot_mjx.envs.adapted_env import AdaptedEnv
+    from jetbot_mjx.envs.checks.probe import TaskProbe, call_methods, first_key
+    from onekernel.build import fingerprint
+
+    if isinstance(env, AdaptedEnv):
+        return fingerprint(*env.traced)
+    task = env.task
+    methods = jax.make_jaxpr(call_methods(task))(TaskProbe(task, env.config).example)
+    found = fingerprint(methods, jax.make_jaxpr(task.sample)(first_key()))
+    return found and f"{found} {task.layout} {_model_hash(env.physics.mj_model)}"
+
+
+def _model_hash(model: "mujoco.MjModel") -> str:
+    """Return a hash of a MuJoCo model."""
+    import mujoco
+
     content = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
     return hashlib.sha256(content.tobytes()).hexdigest()

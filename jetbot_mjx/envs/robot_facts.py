@@ -1,16 +1,20 @@
 """Tell what a robot is, how it follows its commands, and how fast it is simulated."""
 
+import itertools
 import math
 import time
 from collections.abc import Iterator
 from typing import Any
 
 import jax
+import mujoco
+import numpy as np
 
-from jetbot_mjx.config import MjcfRobotConfig
+from jetbot_mjx.config import MjcfRobotConfig, RobotConfig
 from jetbot_mjx.envs.drive import AckermannDrive, OwnDrive
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_trial import Trial, drive_trial
+from jetbot_mjx.envs.mjcf_robot import PREFIX
+from jetbot_mjx.envs.robot_trial import Trial, drive_trial, trial_turn
 from jetbot_mjx.envs.task import reach_on_floor
 
 _STEPS = 64
@@ -18,6 +22,15 @@ _STEPS = 64
 
 _WELL = 0.05
 """Largest share by which a robot may turn less or more than it is told, without a hint."""
+
+_WIDEST = 2.0
+"""Largest separation of wheels that a configuration may have [m]."""
+
+_TRIES = 6
+"""Separations of wheels that are tried before one is proposed."""
+
+_DAMPED = 0.6
+"""Power of the turn by which the next one differs: turns grow by up to its square."""
 
 _BADLY = 0.3
 """Share from which a training is told so."""
@@ -55,19 +68,27 @@ def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
         yield "turn", f"{trial.turn:.0%} of the yaw rate that is commanded"
     if (reach := reach_on_floor(env.task, height)) is not None:
         yield "goals", f"reached within {1e3 * reach:.3g} mm on the floor"
-    for hint in (*_turn_hint(env, trial, _WELL), *_goal_hints(env, trial)):
+    hints = (*_turn_hint(env, trial, _WELL), *_goal_hints(env, trial), *_contact_hint(model))
+    for hint in hints:
         yield "hint", hint
 
 
 def training_hints(env: JetBotEnv) -> list[str]:
-    """Return the settings without which a robot that is a model of its own may not learn.
+    """Return the settings without which a robot of a user's own may not learn.
 
     Args:
       env: one environment, unwrapped.
+
+    Raises:
+      UserError: it does not follow its commands at all.
     """
-    if env.trial is None:
+    trial = env.trial
+    if isinstance(env.robot, RobotConfig) and env.robot.label != env.robot.preset:
+        trial = drive_trial(env.config, env.physics.mj_model, env.drive)
+    if trial is None:
         return []
-    return [*_turn_hint(env, env.trial, _BADLY), *_goal_hints(env, env.trial)]
+    contacts = _contact_hint(env.physics.mj_model)
+    return [*_turn_hint(env, trial, _BADLY), *_goal_hints(env, trial), *contacts]
 
 
 def _turn_hint(env: JetBotEnv, trial: Trial, least: float) -> Iterator[str]:
@@ -85,10 +106,17 @@ def _turn_hint(env: JetBotEnv, trial: Trial, least: float) -> Iterator[str]:
         return
     own = isinstance(env.robot, MjcfRobotConfig)
     key = "wheel_separation" if own else "controller_wheel_separation"
-    fits = drive.wheel_separation / trial.turn
+    # A robot that skids does not turn in proportion: try what is proposed.
+    fits, turn = drive.wheel_separation, trial.turn
+    tried: list[tuple[float, float, float]] = []
+    for _ in range(_TRIES):
+        fits = min(float(f"{fits * max(turn, _WELL) ** -_DAMPED:.2g}"), _WIDEST)
+        turn = trial_turn(env.physics.mj_model, drive._replace(wheel_separation=fits))
+        tried.append((abs(turn - 1.0), fits, turn))
+    _, fits, turn = min(tried)
     yield (
         f"the robot turns with {trial.turn:.0%} of the yaw rate that is commanded:"
-        f" robot.{key} = {fits:.2g} would make that 100 %"
+        f" robot.{key} = {fits:.2g} would make that {turn:.0%}"
     )
 
 
@@ -122,6 +150,38 @@ def _goal_hints(env: JetBotEnv, trial: Trial) -> Iterator[str]:
             f" {env.config.ppo.discounting:g}: {1.0 - proposed * env.dt / half:.3g} would reach"
             " further"
         )
+
+
+def _contact_hint(model: mujoco.MjModel) -> Iterator[str]:
+    """Yield which contacts make a step slow, and may be needless.
+
+    Args:
+      model: the compiled scene, with the robot.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    floor = model.geom("floor").id
+    own = np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.jnt_bodyid[0]).tolist()
+    pairs = sum(_may_touch(model, one, other) for one, other in itertools.combinations(own, 2))
+    idle = [x for x in own if _may_touch(model, floor, x) and x not in data.contact.geom]
+    names = ", ".join(model.geom(x).name.removeprefix(PREFIX) or "a geom" for x in idle[:3])
+    parts = [f"{pairs} pairs of the robot's own parts"] * bool(pairs)
+    parts += [f"{names}{' and others' * (len(idle) > 3)} with the floor"] * bool(idle)
+    if parts:
+        yield (
+            f"each step looks for contacts of {' and of '.join(parts)}, which costs: give what only"
+            ' shows contype="0" conaffinity="0", and what touches the floor alone conaffinity="0"'
+        )
+
+
+def _may_touch(model: mujoco.MjModel, one: int, other: int) -> bool:
+    """Return whether MuJoCo looks for contacts of two geoms, unless the scene names the pair."""
+    bodies = model.body_weldid[model.geom_bodyid[[one, other]]]
+    parents = model.body_weldid[model.body_parentid[bodies]]
+    related = bool(bodies.min()) and (bodies[0] == parents[1] or bodies[1] == parents[0])
+    types, affinities = model.geom_contype[[one, other]], model.geom_conaffinity[[one, other]]
+    meets = bool((types & affinities[::-1]).any())
+    return meets and bodies[0] != bodies[1] and not related
 
 
 def step_rate(env: JetBotEnv, robots: int) -> float:

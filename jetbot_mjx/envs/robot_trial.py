@@ -51,41 +51,58 @@ def drive_trial(config: Config, model: mujoco.MjModel, drive: Drive) -> Trial | 
       UserError: the robot is unstable, a driven wheel does not touch the floor, or the robot does
         not follow.
     """
-    steps = round(_SECONDS / model.opt.timestep)
     if not isinstance(drive, OwnDrive):
         _check_touch(config, model, drive)
     _check_stable(config, model, drive)
     if isinstance(drive, OwnDrive):
         return None
-    # Straight ahead, and in a curve.
-    both = _controls(drive, np.array([(1.0, 0.0), _CURVE]))
-    ahead, curve = (_run(model, np.tile(one, (steps, 1))) for one in both)
-    assert ahead is not None
-    assert curve is not None
-    half = steps // 2
+    ahead = _hold(model, drive, (1.0, 0.0))
+    half = len(ahead) // 2
     speed = float((ahead[-1, 0] - ahead[half, 0]) / (_SECONDS - half * model.opt.timestep))
     share = speed / config.task.max_speed
     if not _SLOWEST < share < _FASTEST:
         raise _error(
             config,
             f"told to drive ahead with task.max_speed = {config.task.max_speed:g} m/s, it drives"
-            f" with {speed:.3g} m/s: the motors are too weak, the wheels slip, or another part"
-            " drags on the floor",
+            f" with {speed:.3g} m/s: the motors are too weak or too slow, the wheels slip, or"
+            " something holds it, such as a part that drags on the floor, a joint's damping or an"
+            " equality",
         )
-    length = np.linalg.norm(np.diff(curve[half:, :2], axis=0), axis=1).sum()
-    turned = curve[half:, 2].mean() * (_SECONDS - half * model.opt.timestep)
-    rate = float(curve[half:, 2].mean())
-    if isinstance(drive, AckermannDrive):
-        turn = float(turned / length / (0.5 * drive.max_curvature))
-    else:
-        turn = rate / (0.5 * drive.max_yaw_rate)
+    turn = trial_turn(model, drive)
     if turn < _LEAST_TURN:
         raise _error(
             config,
-            f"told to turn half as fast as it may, it turns with {rate:.3g} rad/s: a joint or"
+            f"told to turn half as fast as it may, it turns {turn:.2g} times as fast: a joint or"
             " another part holds it, or the wheels are too far apart for their grip",
         )
     return Trial(share, turn)
+
+
+def trial_turn(model: mujoco.MjModel, drive: DifferentialDrive | AckermannDrive) -> float:
+    """Return the yaw rate, or of a car the curvature, as a share of the commanded one.
+
+    Args:
+      model: the compiled scene, with the robot.
+      drive: the robot's drive.
+    """
+    curve = _hold(model, drive, _CURVE)
+    half = len(curve) // 2
+    rate = float(curve[half:, 2].mean())
+    if not isinstance(drive, AckermannDrive):
+        return rate / (0.5 * drive.max_yaw_rate)
+    length = np.linalg.norm(np.diff(curve[half:, :2], axis=0), axis=1).sum()
+    turned = rate * (_SECONDS - half * model.opt.timestep)
+    return float(turned / length / (0.5 * drive.max_curvature))
+
+
+def _hold(
+    model: mujoco.MjModel, drive: Drive, action: tuple[float, float]
+) -> Float[np.ndarray, "t 3"]:
+    """Return (x, y, yaw rate) of a robot that holds an action, and is known to be stable."""
+    steps = round(_SECONDS / model.opt.timestep)
+    path = _run(model, np.tile(_controls(drive, np.array([action])), (steps, 1)))
+    assert path is not None
+    return path
 
 
 def _check_stable(config: Config, model: mujoco.MjModel, drive: Drive) -> None:

@@ -1,7 +1,7 @@
 """Define the state of an environment: Brax's state, as small as physics allows."""
 
 from flax import struct
-from jaxtyping import Array, Float, PyTree, UInt32
+from jaxtyping import Array, Float, PyTree
 
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ, QVEL_ANGULAR_B, QVEL_LINEAR_W
@@ -37,21 +37,23 @@ class State(struct.PyTreeNode):
     The names are stored in checkpoints.
     """
 
-    pipeline_state: PhysicsState
-    """The physics state; the name is Brax's."""
+    pipeline_state: PyTree
+    """The `PhysicsState`; the name is Brax's. An environment of one's own has what it likes."""
     obs: Obs
     reward: Float[Array, ""]
     """Reward of the last step."""
     done: Float[Array, ""]
     """1 where the last step ended the episode, else 0."""
-    metrics: dict[str, Float[Array, ""]]
+    metrics: dict[str, Float[Array, ""]] = struct.field(default_factory=dict)
     """Metrics of the last step; the names are the same at every step."""
-    info: dict[str, PyTree]
+    info: dict[str, PyTree] = struct.field(default_factory=dict)
     """Fields of wrappers and trainers; the names are the same at every step."""
-    goal: Goal
-    """The goal that the task drew for this episode, as it stands now."""
-    key: UInt32[Array, "2"]
-    """Random key from which the next episode is drawn."""
+    goal: Goal = ()
+    """The goal that the task drew for this episode, as it stands now; an environment of one's own
+    has none."""
+    key: PyTree = None
+    """Random key from which the next episode is drawn, shape (2,) and uint32; an environment of
+    one's own need not set it."""
     episode_params: PyTree = None
     """`EpisodeParams` of a `DomainRandomizationWrapper`: the robot parameters of this episode and
     the states of actuators, sensors and camera. None: the robot is its preset."""

@@ -5,12 +5,8 @@ built as `Class(task_config)` and named in YAML as `package.module:Class`. No me
 axis: batch with `jax.vmap`. Frames: `_w` world, `_b` body (x forward, y left, z up).
 """
 
-import difflib
-import importlib
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -18,9 +14,10 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
-from jetbot_mjx.config import TaskConfig, find_task_here
+from jetbot_mjx.config import TaskConfig
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.errors import InvalidError, MissingPackageError, UserError
+from jetbot_mjx.envs.own_class import import_class
+from jetbot_mjx.errors import InvalidError, UserError
 
 Goal = PyTree
 """Arrays in any pytree that a task draws for an episode; `GoalTask` draws a position [m], world
@@ -358,7 +355,7 @@ def make_task(config: TaskConfig, task_class: TaskClass | None = None) -> Task:
     Raises:
       UserError: the name is malformed, cannot be imported, or does not name a task.
     """
-    found = task_class or _import_class(config.name)
+    found = task_class or import_class("task.name", config.name)
     _check_members(config.name, found, METHODS)
     if found is Task:
         raise InvalidError(
@@ -367,46 +364,6 @@ def make_task(config: TaskConfig, task_class: TaskClass | None = None) -> Task:
     task = found(config)
     _check_members(config.name, task, ("layout",))
     return task
-
-
-def _import_class(name: str) -> Any:
-    """Import what a name `package.module:Class` refers to, which may not be a class."""
-    module_name, separator, class_name = name.partition(":")
-    if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:
-        # Python itself separates a class from its module by a dot.
-        likely = ":".join(module_name.rpartition(".")[::2])
-        hint = f", perhaps {likely}" if not separator and likely[0] not in ".:" else ""
-        raise InvalidError(f"task.name = {name!r} is wrong: write package.module:Class{hint}")
-    if module_name.endswith(".py"):
-        likely = f"{module_name.removesuffix('.py').replace(os.sep, '.')}:{class_name}"
-        raise InvalidError(f"task.name = {name!r} names a file: write the module, {likely}")
-    find_task_here(module_name)
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if f"{module_name}.".startswith(f"{error.name}."):
-            here = sorted(path.stem for path in Path().glob("*.py"))
-            close = difflib.get_close_matches(module_name, here, n=1)
-            hint = f": did you mean {close[0]}:{class_name}?" if close else ""
-            raise MissingPackageError(
-                f"task.name = {name!r}: there is no {module_name.replace('.', os.sep)}.py beside"
-                f" the YAML file or in the current folder, and no such package{hint}"
-            ) from None
-        raise MissingPackageError(
-            f"task.name = {name!r}: {module_name} imports {error.name!r}, which is not installed:"
-            " install it"
-        ) from None
-    except SyntaxError as error:
-        raise InvalidError(
-            f"task.name = {name!r}: {error.filename}, line {error.lineno}, is not valid Python:"
-            f" {error.msg}"
-        ) from None
-    task_class = getattr(module, class_name, None)
-    if task_class is None:
-        close = difflib.get_close_matches(class_name, dir(module), n=1)
-        hint = f": did you mean {close[0]!r}?" if close else ""
-        raise InvalidError(f"task.name = {name!r}: {module_name} has no {class_name!r}{hint}")
-    return task_class
 
 
 def _check_members(name: str, task: object, members: Sequence[str]) -> None:

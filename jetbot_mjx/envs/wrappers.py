@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
 from jetbot_mjx.envs import mjx
+from jetbot_mjx.envs.adapted_env import AdaptedEnv
 from jetbot_mjx.envs.camera.wrapper import with_camera
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
@@ -32,7 +33,7 @@ RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]
 class _Env(Protocol):
     """The interface that a wrapper requires of the environment inside it."""
 
-    unwrapped: JetBotEnv
+    unwrapped: JetBotEnv | AdaptedEnv
 
     def reset(self, rng: UInt32[Array, "2"]) -> State: ...
 
@@ -46,7 +47,7 @@ class _PackedEnv(_Env, Protocol):
 
 
 def wrap_for_training(
-    env: JetBotEnv,
+    env: JetBotEnv | AdaptedEnv,
     episode_length: int,
     action_repeat: int = 1,
     randomization_fn: RandomizationFn | None = None,
@@ -73,7 +74,10 @@ def wrap_for_training(
       (n, 2).
     """
 
-    def wrap_one(env: JetBotEnv) -> NewEpisodeWrapper:
+    def wrap_one(env: JetBotEnv | AdaptedEnv) -> NewEpisodeWrapper:
+        # Only a robot has a camera, and anything to draw.
+        if isinstance(env, AdaptedEnv):
+            return NewEpisodeWrapper(EpisodeWrapper(env, episode_length, action_repeat))
         varied = maybe_randomize(env)
         one = env.blind() if isinstance(varied, JetBotEnv) else varied
         if final_images:
@@ -81,7 +85,7 @@ def wrap_for_training(
         return NewEpisodeWrapper(EpisodeWrapper(one, episode_length, action_repeat))
 
     camera = None if final_images else env.camera
-    if randomization_fn is None:
+    if randomization_fn is None or isinstance(env, AdaptedEnv):
         return BatchWrapper(with_camera(KernelWrapper(wrap_one(env)), camera))
     return RandomizedBatchWrapper(
         env, lambda env: with_camera(wrap_one(env), camera), randomization_fn
@@ -180,8 +184,9 @@ class EpisodeWrapper(Wrapper):
 
         # Decide how the episode ends, if it does.
         steps = steps + length
-        out_of_time = steps >= self.episode_length
         terminated = nstate.info["terminated"]
+        # An environment of one's own may have a time limit of its own.
+        out_of_time = (steps >= self.episode_length) | (nstate.done > terminated)
         truncation = jnp.where(out_of_time | ~finite, 1.0 - terminated, 0.0)
         done = jnp.maximum(terminated, truncation)
 
@@ -279,11 +284,11 @@ class KernelWrapper(Wrapper):
           env: the environment, in all wrappers of a single robot but that of the camera.
         """
         super().__init__(env)
-        physics = self.env.unwrapped.physics
+        unwrapped = self.env.unwrapped
 
         def report_unsupported(error: UnsupportedError) -> None:
             # If physics is not a kernel, it has reported the reason already.
-            if physics.may_be_kernel:
+            if unwrapped.may_be_kernel:
                 reason = f"one kernel cannot do {error}: the page on own tasks says what to avoid"
                 report(Fallback("environment step", reason))
 
@@ -291,9 +296,9 @@ class KernelWrapper(Wrapper):
             return fuse(
                 function,
                 on_unsupported=report_unsupported,
-                may_be_kernel=lambda: physics.may_be_kernel,
-                explain=physics.kernel_impl.explain,
-                on_fallback=physics.kernel_impl.report_fallback,
+                may_be_kernel=lambda: unwrapped.may_be_kernel,
+                explain=unwrapped.kernel_impl.explain,
+                on_fallback=unwrapped.kernel_impl.report_fallback,
             )
 
         def step_packed(packed: Packed, action: Float[Array, " action"]) -> Packed:

@@ -242,7 +242,7 @@ class _Reporter:
     def _build(self, checkpoint: Checkpoint, setup: Setup, ranges: RandomizationConfig) -> None:
         """Build the evaluators and evaluate the baselines, unless the present ones fit."""
         config, params = checkpoint.config, checkpoint.params
-        env, networks, programs = setup.env, setup.networks, setup.programs
+        env, networks, programs = setup.robot_env, setup.networks, setup.programs
         # The parts of a configuration that the compiled episodes depend on.
         parts = (
             config.task,
@@ -276,7 +276,7 @@ class _Reporter:
         has = {
             "robustness": self._robustness,
             "mujoco": self._in_mujoco,
-            "rendered": self._pictures and setup.env.camera is not None,
+            "rendered": self._pictures and setup.robot_env.camera is not None,
             "randomized": bool(ranges.drawn),
         }
         return frozenset(name for name, wanted in has.items() if wanted)
@@ -288,7 +288,7 @@ class _Reporter:
             sweeper = Sweeper(setup, keys[:SWEEP_GOALS])
             found["robustness"] = sweeper.run(params)
         if self._randomized:
-            found["randomized"] = summarize(self._randomized.run(params, keys), setup.env.dt)
+            found["randomized"] = summarize(self._randomized.run(params, keys), setup.robot_env.dt)
         if self._mujoco:
             found["mujoco"] = self._mujoco.run(params, keys)
         return found
@@ -310,7 +310,7 @@ class _Reporter:
           again: whether to write a report also where there is one that is at least as full.
         """
         config, ranges = checkpoint.config, self._ranges or checkpoint.config.randomization
-        env = setup.env
+        env = setup.robot_env
         # Choose the folder of the report.
         parts = self._parts(setup, ranges)
         wanted = checkpoint.results_dir / _FOLDER, checkpoint.path.name, len(self._keys), parts

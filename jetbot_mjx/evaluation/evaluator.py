@@ -6,8 +6,8 @@ for the evaluations during training, by which the best checkpoint is chosen, and
 """
 
 import math
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,10 @@ from jetbot_mjx.runs import JsonObject
 from jetbot_mjx.terminal import stage
 from onekernel import ProgramCache
 
-_NORMAL_QUANTILE = 1.959963984540054
+NORMAL_QUANTILE = 1.959963984540054
 """Quantile of the normal distribution at 97.5 %."""
+
+_Results = TypeVar("_Results")
 
 _REPORT_SEED = 20_251
 _TRAINING_SEED = 20_252
@@ -75,6 +77,11 @@ class Summary(NamedTuple):
     final_distance_median: float
     """[m] Median over all episodes of the distance to the goal at the end, on the floor."""
     nonfinite_envs: int
+
+    @property
+    def score(self) -> float:
+        """Return the number by which the best checkpoint of a training is found."""
+        return self.success_rate
 
 
 def summarize(episodes: Episodes, ctrl_dt: float) -> Summary:
@@ -170,7 +177,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
     Source: E. B. Wilson, JASA 22 (1927), 209-212, doi:10.1080/01621459.1927.10502953.
     """
-    p, n, z = successes / trials, trials, _NORMAL_QUANTILE
+    p, n, z = successes / trials, trials, NORMAL_QUANTILE
     centre = p + z * z / (2 * n)
     spread = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     scale = 1 + z * z / n
@@ -192,37 +199,28 @@ def policy_controller(networks: Networks) -> Controller:
     return lambda params, state, key: make_policy(networks, params)(state.obs)
 
 
-class Evaluator:
-    """An `Evaluator` evaluates policies, and optionally baselines, with one compiled program."""
+class CompiledRollout(Generic[_Results]):
+    """A `CompiledRollout` runs episodes under one of several controllers, by one program."""
 
     def __init__(
         self,
-        env: JetBotEnv | DomainRandomizationWrapper,
-        networks: Networks,
+        run: Callable[..., _Results],
+        controllers: Sequence[str],
         programs: ProgramCache,
-        *,
-        baselines: bool = False,
-        record: bool = False,
+        label: str = "",
+        robots: str = "",
     ) -> None:
         """Prepare the program, which compiles at its first use.
 
         Args:
-          env: one unwrapped environment, or one with domain randomization.
-          networks: the networks of the policies to evaluate.
+          run: a function of the index of a controller, its parameters and the reset keys.
+          controllers: the names of the controllers.
           programs: the cache of compiled programs for the environment's configuration.
-          baselines: whether `run` can also run the controllers of `BASELINES`.
-          record: whether to record trajectories.
+          label: what tells the program from others of these controllers.
+          robots: what to tell the user about the robots.
         """
-        self._env = env
-        controllers = {"policy": policy_controller(networks)}
-        if baselines:
-            controllers |= {name: make(env) for name, make in BASELINES.items()}
-        self._names = list(controllers)
-        length = env.config.task.episode_length
-        self._run = jax.jit(rollout_fn(env, [*controllers.values()], length, record=record))
-        drawn = ", drawn" if isinstance(env, DomainRandomizationWrapper) else ""
-        self._name = f"episodes of {self._names}{', recorded' if record else ''}{drawn}"
-        self._robots = " on drawn robots" if drawn else ""
+        self._run, self._names = jax.jit(run), list(controllers)
+        self._name, self._robots = f"episodes of {self._names}{label}", robots
         self._programs = programs
         self._compiling: dict[int, Callable[[], jax.stages.Compiled]] = {}
         self._compiled: dict[int, jax.stages.Compiled] = {}
@@ -244,13 +242,13 @@ class Evaluator:
 
     def run(
         self, params: PolicyParams, keys: UInt32[Array, "n 2"], controller: str = "policy"
-    ) -> Episodes:
+    ) -> _Results:
         """Run deterministic episodes of a policy, or episodes of a baseline.
 
         Args:
           params: parameters of the policy, or of any policy for a baseline.
           keys: one reset key for each episode.
-          controller: `policy`, or one of `BASELINES`.
+          controller: `policy`, or the name of a baseline.
 
         Returns:
           The episodes.
@@ -266,6 +264,41 @@ class Evaluator:
                 self._compiled[count] = self._compiling.pop(count)()
         with stage(f"episodes, {controller}{self._robots}", count):
             return jax.block_until_ready(self._compiled[count](*arguments))
+
+
+class Evaluator(CompiledRollout[Episodes]):
+    """An `Evaluator` evaluates policies of a robot, and optionally baselines."""
+
+    def __init__(
+        self,
+        env: JetBotEnv | DomainRandomizationWrapper,
+        networks: Networks,
+        programs: ProgramCache,
+        *,
+        baselines: bool = False,
+        record: bool = False,
+    ) -> None:
+        """Prepare the program, which compiles at its first use.
+
+        Args:
+          env: one unwrapped environment, or one with domain randomization.
+          networks: the networks of the policies to evaluate.
+          programs: the cache of compiled programs for the environment's configuration.
+          baselines: whether `run` can also run the controllers of `BASELINES`.
+          record: whether to record trajectories.
+        """
+        controllers = {"policy": policy_controller(networks)}
+        if baselines:
+            controllers |= {name: make(env) for name, make in BASELINES.items()}
+        length = env.config.task.episode_length
+        drawn = isinstance(env, DomainRandomizationWrapper)
+        super().__init__(
+            rollout_fn(env, [*controllers.values()], length, record=record),
+            [*controllers],
+            programs,
+            f"{', recorded' if record else ''}{', drawn' if drawn else ''}",
+            " on drawn robots" if drawn else "",
+        )
 
 
 def _random(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:

@@ -102,7 +102,7 @@ class Sweeper:
           sweeps: the parameters with their values; those that the robot does not have,
             and without a camera those of looks, are left out.
         """
-        env, networks = setup.env, setup.networks
+        env, networks = setup.robot_env, setup.networks
         sees = env.camera is not None
         self._env, self._keys = env, keys
         self._sweeps = tuple(
@@ -216,7 +216,7 @@ class MujocoEvaluator:
           UserError: JAX is configured without a CPU, or pictures are asked for on a machine
             without OpenGL.
         """
-        env, networks, programs = setup.env, setup.networks, setup.programs
+        env, networks, programs = setup.robot_env, setup.networks, setup.programs
         self._numerics, self._dt = numerics, env.dt
         simulator = envs.in_mujoco(env, numerics)
         robots: list[envs.JetBotEnv | DomainRandomizationWrapper] = [simulator]

@@ -10,7 +10,7 @@ from .checkpoint_store import CheckpointStore as CheckpointStore
 from .checkpoint_store import checkpoint_path as checkpoint_path
 from .checkpoint_store import checkpoint_steps as checkpoint_steps
 from .checkpoint_store import digest as digest
-from .checkpoint_store import stored_success_rate as stored_success_rate
+from .checkpoint_store import stored_score as stored_score
 from .metrics import EVALUATION_VIDEO as EVALUATION_VIDEO
 from .metrics import METRICS as METRICS
 from .metrics import CompileClock as CompileClock
@@ -60,7 +60,7 @@ from .setup import Setup as Setup
 from .task_code import TaskCode as TaskCode
 from .task_code import collect_task_code as collect_task_code
 from .task_code import read_task_code as read_task_code
-from .task_code import stored_task_class as stored_task_class
+from .task_code import stored_class as stored_class
 from .task_code import write_task_code as write_task_code
 from .train_log import TRAIN_LOG as TRAIN_LOG
 from .train_log import log_message as log_message

@@ -14,7 +14,7 @@ from jetbot_mjx import agents
 from jetbot_mjx.agents import Networks, Policy, PolicyParams
 from jetbot_mjx.config import Config
 from jetbot_mjx.devices import require_float32
-from jetbot_mjx.envs import JetBotEnv, LayoutData, layout_data
+from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, LayoutData, layout_data
 from jetbot_mjx.errors import InvalidError, UserError, os_errors, shown
 from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint_store import FOLDER, CheckpointError, CheckpointNotFoundError
@@ -22,7 +22,7 @@ from jetbot_mjx.runs.run_dir import JsonObject, parse_stored
 from jetbot_mjx.runs.run_finder import PRETRAINED as PRETRAINED
 from jetbot_mjx.runs.run_finder import ROOT, explain_missing, find_run, scan_runs, suggest_run
 from jetbot_mjx.runs.setup import Setup
-from jetbot_mjx.runs.task_code import stored_task_class
+from jetbot_mjx.runs.task_code import stored_class
 
 Which = Literal["best", "last"] | int
 """Selects a checkpoint of a run: the best, the last, or one by its environment steps."""
@@ -83,28 +83,28 @@ class Checkpoint(NamedTuple):
             return ROOT / "pretrained" / self.run_dir.name
         return self.run_dir
 
-    def make_env(self) -> JetBotEnv:
+    def make_env(self) -> JetBotEnv | AdaptedEnv:
         """Build the environment that the policy was trained in, for the available devices."""
         return self.make_setup().env
 
     def make_setup(self) -> Setup:
         """Build the environment that the policy was trained in, for the available devices.
 
-        The code of a task of one's own is what the run stored, if that cannot be imported by name
-        or has changed.
+        The code of a task or an environment of one's own is what the run stored, if that cannot be
+        imported by name or has changed.
 
         Raises:
-          UserError: the task cannot be built, or its stored code is damaged.
+          UserError: it cannot be built, or its stored code is damaged.
           CheckpointError: its observation differs from the one that the policy was trained on.
         """
-        task_class = stored_task_class(self.run_dir, self.config.task.name)
+        own_class = stored_class(self.run_dir, self.config.code)
         config = self.config.for_any_device()
-        setup = Setup(config, task_class=task_class, networks=self.networks)
-        layout = layout_data(setup.env.task.layout)
+        setup = Setup(config, own_class=own_class, networks=self.networks)
+        layout = layout_data(setup.env.layout)
         if layout != self.about["layout"]:
             raise CheckpointError(
                 f"checkpoint {self.path} was trained on another observation than"
-                f" {self.config.task.name} gives: {_names(self.about['layout'])} then,"
+                f" {self.config.code} gives: {_names(self.about['layout'])} then,"
                 f" {_names(layout)} here"
             )
         return setup
@@ -114,12 +114,12 @@ def _names(layout: LayoutData) -> str:
     return " ".join(f"{field['name']}[{field['size']}]" for field in layout)
 
 
-def about_policy(config: Config, env: JetBotEnv) -> JsonObject:
+def about_policy(config: Config, env: JetBotEnv | AdaptedEnv) -> JsonObject:
     """Return the metadata that every checkpoint of a run carries, as JSON values."""
     return {
         "format": FORMAT,
         "config": config.model_dump(mode="json"),
-        "layout": layout_data(env.task.layout),
+        "layout": layout_data(env.layout),
         "observation_size": env.observation_size,
         "action_size": env.action_size,
         "ctrl_dt": env.dt,
@@ -307,7 +307,7 @@ def _find(path: Path, which: Which) -> Path:
         step = steps[-1]
     elif which == "best":
         # Prefer the later of equally good ones, because it was trained for longer.
-        step = max(steps, key=lambda step: (checkpoint_store.stored_success_rate(path, step), step))
+        step = max(steps, key=lambda step: (checkpoint_store.stored_score(path, step), step))
     elif which in steps:
         step = which
     else:

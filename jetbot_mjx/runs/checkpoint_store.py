@@ -58,7 +58,7 @@ _ABOUT = "about"
 _DIGESTS = "sha256"
 _JOINED = "joined"
 _BYTES = "bytes"
-_SUCCESS = "success_rate"
+_SCORE = "score"
 _STEP_DIGITS = 12
 _SPARE_BYTES = 1_000_000
 _DELETED = ".deleted"
@@ -101,8 +101,8 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
           run_dir: the run folder, which must exist.
           keep: the number of latest checkpoints to keep, besides the first and the best.
         """
-        self._success = {
-            step: stored_success_rate(run_dir, step) for step in checkpoint_steps(run_dir)
+        self._scores = {
+            step: stored_score(run_dir, step) for step in checkpoint_steps(run_dir)
         }
         self._keep = keep
         self._manager: "ocp.CheckpointManager | None" = None
@@ -117,7 +117,7 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
         env_steps: int,
         trees: Mapping[str, PyTree],
         about: JsonObject,
-        success_rate: float | None,
+        score: float | None,
         joined: Collection[str] = (),
     ) -> None:
         """Start to write one checkpoint in the background.
@@ -126,8 +126,8 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
           env_steps: the number of environment steps so far, which is the name of the folder.
           trees: the trees of arrays on the host, by name.
           about: the metadata of the trees, as JSON values.
-          success_rate: the success rate, by which the best checkpoint is found; None if the policy
-            was not evaluated.
+          score: the number by which the best checkpoint is found; None if the policy was not
+            evaluated.
           joined: the names of the trees whose arrays are written as one.
 
         Raises:
@@ -142,12 +142,12 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
         self._check_space(sum(x.nbytes for tree in flat.values() for x in tree.values()))
         # Add the digests by which a reader recognises damage.
         digests = {name: digest(tree) for name, tree in flat.items()}
-        about = {**about, "env_steps": env_steps, _SUCCESS: success_rate, _DIGESTS: digests}
+        about = {**about, "env_steps": env_steps, _SCORE: score, _DIGESTS: digests}
         about[_JOINED] = {name: _table(flat[name]) for name in joined}
         about[_DIGESTS] = {**digests, _ABOUT: _digest_json(about)}
         arrays = {name: _join(x) if name in joined else x for name, x in flat.items()}
         # Hand over to Orbax, which writes in the background.
-        self._success[env_steps] = -1.0 if success_rate is None else success_rate
+        self._scores[env_steps] = -math.inf if score is None else score
         with self._writing():
             # Orbax is imported with the first checkpoint, while a program compiles.
             from jetbot_mjx.runs.checkpoint_manager import open_manager, start_save
@@ -155,7 +155,7 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
             if self._manager is None:
                 self._log.enter_context(_without_log())
                 self._manager = open_manager(
-                    self._folder, self._keep, self._success, _STEP_DIGITS, _DELETED
+                    self._folder, self._keep, self._scores, _STEP_DIGITS, _DELETED
                 )
             if not start_save(self._manager, env_steps, arrays, {_ABOUT: about}):
                 raise ValueError(f"there is one after {env_steps} steps or more")
@@ -359,13 +359,13 @@ def digest(tree: PyTree) -> str:
     return total.hexdigest()
 
 
-def stored_success_rate(run_dir: Path, env_steps: int) -> float:
-    """Return a checkpoint's success rate, or -1 if it was not evaluated or is damaged."""
+def stored_score(run_dir: Path, env_steps: int) -> float:
+    """Return the score of a checkpoint, -infinity if it was not evaluated or is damaged."""
     try:
-        rate = read_about(checkpoint_path(run_dir, env_steps)).get(_SUCCESS)
+        score = read_about(checkpoint_path(run_dir, env_steps)).get(_SCORE)
     except CheckpointError:
-        return -1.0
-    return rate if isinstance(rate, int | float) and 0 <= rate <= 1 else -1.0
+        return -math.inf
+    return score if isinstance(score, int | float) and math.isfinite(score) else -math.inf
 
 
 def _digest_json(values: JsonObject) -> str:

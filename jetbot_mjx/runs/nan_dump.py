@@ -14,11 +14,11 @@ import numpy as np
 from jetbot_mjx.agents import NanDump
 from jetbot_mjx.config import Config, ConfigError
 from jetbot_mjx import envs
-from jetbot_mjx.envs import JetBotEnv, State, Task
+from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, PhysicsState, State
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import flatten
 from jetbot_mjx.runs.run_dir import parse_stored, read_bytes, write_bytes
-from jetbot_mjx.runs.task_code import stored_task_class
+from jetbot_mjx.runs.task_code import stored_class
 
 FOLDER = "nan_dumps"
 """Name of the folder of dumps in a run folder."""
@@ -42,7 +42,7 @@ class StoredNanDump(NamedTuple):
     env_steps: int
     """Environment steps of the training at the end of the call that found the non-finite state."""
     nan_dump: NanDump
-    task_class: type[Task] | None = None
+    own_class: type | None = None
     """The class of the task, if its code is stored in the run; None: it is imported by name."""
 
 
@@ -94,8 +94,8 @@ def load_nan_dump(path: Path) -> StoredNanDump:
             raise InvalidError(f"{path} has the format {shown(about['format'])}, not {_FORMAT!r}")
         run_dir = Path(path).absolute().parent.parent
         config = parse_stored(about["config"], run_dir, "stored config")
-        task_class = stored_task_class(run_dir, config.task.name)
-        template = _template(config, task_class)
+        own_class = stored_class(run_dir, config.code)
+        template = _template(config, own_class)
         wanted = flatten(template)
         if wanted.keys() != arrays.keys():
             odd = sorted(wanted.keys() ^ arrays.keys())[0]
@@ -110,7 +110,7 @@ def load_nan_dump(path: Path) -> StoredNanDump:
         nan_dump = jax.tree.unflatten(
             jax.tree.structure(template), [arrays[name] for name in wanted]
         )
-        return StoredNanDump(config, int(about["env_steps"]), nan_dump, task_class)
+        return StoredNanDump(config, int(about["env_steps"]), nan_dump, own_class)
     except FileNotFoundError:
         raise NotFoundError(f"{path} does not exist: give a file of a run's {FOLDER}/") from None
     except ConfigError as error:
@@ -124,9 +124,9 @@ def load_nan_dump(path: Path) -> StoredNanDump:
         ) from None
 
 
-def _template(config: Config, task_class: type[Task] | None) -> NanDump:
+def _template(config: Config, own_class: type | None) -> NanDump:
     """Return the shapes and dtypes of a dump of this configuration."""
-    env = envs.wrap_for_training(JetBotEnv(config, task_class), config.task.episode_length)
+    env = envs.wrap_for_training(envs.make_env(config, own_class=own_class), config.task.episode_length)
     batched = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((1, 2), np.uint32))
     state: State = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batched)
     return NanDump(
@@ -147,7 +147,9 @@ class ReplayStep(NamedTuple):
     """Names of the arrays that are not finite."""
 
 
-def replay_nan_dump(stored: StoredNanDump, env: JetBotEnv) -> Iterator[ReplayStep]:
+def replay_nan_dump(
+    stored: StoredNanDump, env: JetBotEnv | AdaptedEnv
+) -> Iterator[ReplayStep]:
     """Replay the recorded actions from the state in which the unroll began.
 
     Args:
@@ -169,7 +171,10 @@ def replay_nan_dump(stored: StoredNanDump, env: JetBotEnv) -> Iterator[ReplaySte
 
 
 def format_step(index: int, step: ReplayStep) -> str:
-    """Return one step as a line of the table."""
+    """Return one step as a line of the table; only a robot has a pose."""
+    if not isinstance(step.state.pipeline_state, PhysicsState):
+        action = " ".join(f"{x:+7.3f}" for x in step.action)
+        return f"{index:4d}  {action}  {', '.join(step.nonfinite)}"
     robot = envs.robot_state(jax.tree.map(jnp.asarray, step.state.pipeline_state))
     x, y, z = np.asarray(robot.position_w)
     fastest = np.abs(step.state.pipeline_state.qvel).max()

@@ -16,6 +16,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -399,8 +400,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically: it is complete or unchanged whenever the process ends."""
-    unfinished = path.with_name(f".{path.name}.unfinished")
+    """Write a file atomically: it is complete or unchanged whenever the process ends.
+
+    Others may write the same file at the same time: the last one to complete it stays.
+    """
+    writer = f"{os.getpid()}-{threading.get_ident()}"
+    unfinished = path.with_name(f".{path.name}.{writer}.unfinished")
     # A named pipe in its place would wait for a reader.
     unfinished.unlink(missing_ok=True)
     try:

@@ -1,7 +1,7 @@
-"""Store the source of a task of one's own in the run folder, and import it from there.
+"""Store the source of one's own task or environment in the run folder, and import it from there.
 
-A policy is worth little without the task that it was trained in. When a training begins, the file
-of the task's module and those of the modules that it imports from the same folder are copied to
+A policy is worth little without what it was trained in. When a training begins, the file of the
+module of task or environment and those of the modules that it imports from the same folder are copied to
 `task/` in the run folder, each with its SHA-256. Later commands import the stored files if the
 module cannot be found, or if its files differ from the stored ones. Tasks of this package and of
 installed packages are not stored, because their versions are.
@@ -22,7 +22,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from types import ModuleType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from jetbot_mjx.config import find_task_here, import_root, shipped_folder, source_file
 from jetbot_mjx.errors import UserError
@@ -34,9 +34,6 @@ from jetbot_mjx.runs.run_dir import (
     write_json,
     writing_to,
 )
-
-if TYPE_CHECKING:
-    from jetbot_mjx.envs import Task
 
 FOLDER = "task"
 """Name of the folder in a run folder that holds the source of the task."""
@@ -169,14 +166,14 @@ def read_task_code(run_dir: Path) -> TaskCode | None:
     return TaskCode(module, tuple(sorted(files)))
 
 
-def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> "type[Task] | None":
-    """Import the class of a task from the source that its run stored.
+def stored_class(run_dir: Path, name: str, *, silent: bool = False) -> type | None:
+    """Import the class of a task or an environment from the source that its run stored.
 
     A line on stderr says so, once for each source, unless `silent`.
 
     Args:
       run_dir: the run folder.
-      name: the task as `package.module:Class`.
+      name: the class as `package.module:Class`.
       silent: whether to print nothing.
 
     Returns:
@@ -208,7 +205,7 @@ def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> "typ
         reason = f"{module} on disk differs from the code this run was trained with: using the"
         _say(f"{reason} stored code {shortened(main)}", code)
     else:
-        _say(f"running the task's code stored in {shortened(main)}", code)
+        _say(f"running the code stored in {shortened(main)}", code)
     try:
         found = _import_stored((run_dir / FOLDER).absolute(), code)
     except ModuleNotFoundError as error:
@@ -216,7 +213,7 @@ def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> "typ
             f"{shortened(main)} cannot be imported: no module named {error.name!r}: install it"
         ) from None
     if not hasattr(found, class_name):
-        raise UserError(f"task.name = {name!r}: {shortened(main)} has no {class_name!r}")
+        raise UserError(f"{shortened(main)} has no {class_name!r}, which {name!r} names")
     return getattr(found, class_name)
 
 

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jetbot_mjx.agents import PolicyParams, TrainState, UInt64, last_layer, make_policy
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs import JetBotEnv, LayoutData, State, layout_data
+from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, LayoutData, State, layout_data
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Checkpoint
 from jetbot_mjx.runs.run_dir import JsonObject
@@ -90,13 +90,13 @@ def make_warm_start(source: Checkpoint, setup: Setup) -> WarmStart:
         )
     config = setup.config
     _check_networks(source, config, setup.env)
-    old, new = source.about["layout"], layout_data(setup.env.task.layout)
+    old, new = source.about["layout"], layout_data(setup.env.layout)
     rows = match_rows(old, new)
     names = [[field["name"] for field in layout] for layout in (old, new)]
     if (rows < 0).all():
         raise UserError(
             f"init_from {source.path}: no field of its observation ({', '.join(names[0])}) is one"
-            f" of {config.task.name} ({', '.join(names[1])})"
+            f" of {config.code} ({', '.join(names[1])})"
         )
     # Take over the networks and the statistics, row by row.
     params = PolicyParams(
@@ -134,7 +134,7 @@ def match_rows(old: LayoutData, new: LayoutData) -> Int[np.ndarray, " new"]:
     return np.array([index.get(key, -1) for key in numbers(new)], np.int64)
 
 
-def _check_networks(source: Checkpoint, config: Config, env: JetBotEnv) -> None:
+def _check_networks(source: Checkpoint, config: Config, env: JetBotEnv | AdaptedEnv) -> None:
     ours, theirs = config.ppo.network.model_dump(), source.config.ppo.network.model_dump()
     for name, value in ours.items():
         if theirs[name] != value:
@@ -227,7 +227,8 @@ def _measure(params: PolicyParams, setup: Setup, rows: Int[np.ndarray, " new"]) 
     measured_mean, measured_std = jax.device_get(drive(jax.random.PRNGKey(config.seed)))
     old: PyTree = params.normalizer
     known, count = rows >= 0, _MEASURED_ENVS * config.task.episode_length
-    floor = setup.env.observation_min_std if config.ppo.normalizer == "physical" else 1e-6
+    physical = config.ppo.normalizer == "physical"
+    floor: PyTree = setup.env.observation_min_std if physical else 1e-6
     std = np.where(known, old.std, np.maximum(measured_std, floor)).astype(np.float32)
     return old.replace(
         # Pyright does not follow flax's dataclasses.

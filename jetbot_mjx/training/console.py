@@ -54,6 +54,10 @@ class Terminal:
         self._print(
             f"{env_steps:>12,} steps",
             _formatted(mean, "eval/success_rate", "success {:6.1%}"),
+            # Of a robot with goals, the return says little.
+            _formatted(mean, "eval/episode_return", "return {:9.2f}")
+            if "eval/return_low" in mean
+            else "",
             _formatted(mean, "eval/time_to_goal_median", "to goal {:4.2f} s"),
             _formatted(mean, "time/env_steps_per_second", "{:>10,.0f} steps/s"),
             f"{process_seconds():6.1f} s",
@@ -72,7 +76,8 @@ class Terminal:
         if time.monotonic() - self._last_line >= _SECONDS_BETWEEN_LINES:
             self._print(
                 f"{env_steps:>12,} steps",
-                _formatted(metrics, "rollout/success_rate", "exploring {:6.1%}"),
+                _formatted(metrics, "rollout/success_rate", "exploring {:6.1%}")
+                or _formatted(metrics, "rollout/episode_return", "exploring {:9.2f}"),
                 f"{env_steps_per_second:>10,.0f} steps/s",
                 self._eta(env_steps, env_steps_per_second),
             )

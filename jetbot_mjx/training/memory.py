@@ -19,7 +19,7 @@ from jaxtyping import PyTree
 
 from jetbot_mjx.agents import PPO, activation_bytes
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs import JetBotEnv, make_data
+from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, make_data
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.terminal import text_table
@@ -105,7 +105,7 @@ class Footprint(NamedTuple):
         return int(_OVERHEAD * self.counted) + _PROGRAMS
 
 
-def sizes(ppo: PPO, env: JetBotEnv) -> Sizes:
+def sizes(ppo: PPO, env: JetBotEnv | AdaptedEnv) -> Sizes:
     """Trace a training for its shapes; nothing is computed.
 
     Args:
@@ -144,9 +144,12 @@ def sizes(ppo: PPO, env: JetBotEnv) -> Sizes:
     )
 
 
-def _physics(env: JetBotEnv) -> int:
-    """Return the memory of one physics step of one environment [bytes]."""
-    if env.physics.impl != "xla":
+def _physics(env: JetBotEnv | AdaptedEnv) -> int:
+    """Return the memory of one physics step of one environment [bytes].
+
+    What XLA keeps in a step of an environment of one's own is not known.
+    """
+    if isinstance(env, AdaptedEnv) or env.physics.impl != "xla":
         # A single kernel stores its input and output only, no intermediate results.
         return 2 * _bytes(jax.eval_shape(env.reset, _KEY).pipeline_state)
     return _bytes(make_data(env.physics.mj_model))

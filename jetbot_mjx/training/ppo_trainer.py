@@ -314,7 +314,7 @@ def _train_loop(
         # Show the progress within an interval, and report at its end.
         if done < goal:
             mean = state.replace(tally=np.mean(jax.device_get(state.tally), axis=0))
-            recorder.on_progress(done * size, _metrics(mean.sums, config.entropy_cost), seconds)
+            recorder.on_progress(done * size, _metrics(mean.sums, trainer.ppo), seconds)
             continue
         if not _report(trainer, recorder, state, seconds):
             return
@@ -348,10 +348,9 @@ def _progress(
       seconds: training time since the last report [s].
       restart: whether the state that is returned begins new sums.
     """
-    entropy_cost = trainer.ppo.config.entropy_cost
     progress = []
     for one in trainer.get(state):
-        metrics = _metrics(one.sums, entropy_cost)
+        metrics = _metrics(one.sums, trainer.ppo)
         saved = one.replace(tally=np.zeros_like(one.tally)) if restart else one
         progress.append(Progress(env_steps(one), one.policy_params, metrics, seconds, saved))
     return progress
@@ -373,18 +372,19 @@ def env_steps(state: TrainState) -> int:
     return int(state.env_steps.to_numpy())
 
 
-def _metrics(totals: Mapping[str, Array], entropy_cost: float) -> dict[str, float]:
+def _metrics(totals: Mapping[str, Array], ppo: PPO) -> dict[str, float]:
     """Return means and counts from the sums of a state; empty before the first step."""
     sums = {name: float(value) for name, value in totals.items()}
     steps, episodes = sums["training_steps"], sums["rollout/episodes"]
     if steps == 0:
         return {}
     metrics = {name: sums[name] / steps for name in LOSSES.values()}
-    if entropy_cost > 0:
-        metrics["policy/entropy"] = -metrics["loss/entropy"] / entropy_cost
+    if ppo.config.entropy_cost > 0:
+        metrics["policy/entropy"] = -metrics["loss/entropy"] / ppo.config.entropy_cost
     metrics["rollout/episodes"] = episodes
     if episodes > 0:
-        metrics["rollout/success_rate"] = sums["rollout/successes"] / episodes
+        if ppo.has_success:
+            metrics["rollout/success_rate"] = sums["rollout/successes"] / episodes
         metrics["rollout/episode_return"] = sums["rollout/return"] / episodes
         metrics["rollout/episode_length"] = sums["rollout/length"] / episodes
     metrics["train/nonfinite_envs"] = sums["nonfinite_envs"]

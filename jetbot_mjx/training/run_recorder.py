@@ -15,7 +15,7 @@ from jetbot_mjx.agents import NanDump, PolicyParams
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs import find_backend
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import Summary
+from jetbot_mjx.evaluation import ReturnSummary, Summary
 from jetbot_mjx.interrupts import tell
 from jetbot_mjx.runs import CheckpointStore, JsonObject, MetricValues
 from jetbot_mjx.terminal import process_seconds
@@ -32,9 +32,9 @@ class Standing:
 
     env_steps: Annotated[int, Field(ge=0)] = 0
     best_steps: Annotated[int, Field(ge=0)] = 0
-    best: Summary | None = None
+    best: Summary | ReturnSummary | None = None
     """The best evaluation; of equal ones the latest."""
-    last: Summary | None = None
+    last: Summary | ReturnSummary | None = None
     """The last evaluation."""
     wall_seconds: float = 0.0
     """Time spent on the training so far, in all processes [s]."""
@@ -59,6 +59,10 @@ class Standing:
                 f"{run_dir}: the last checkpoint has unusable metadata: {key} is wrong: move it to"
                 " another folder, and the training continues from the one before"
             ) from None
+
+
+def _reaches(value: float | None, target: float | None) -> bool:
+    return value is not None and target is not None and value >= target
 
 
 def open_sinks(
@@ -109,7 +113,7 @@ class RunRecorder(TrainerCallback, contextlib.AbstractContextManager["RunRecorde
 
     config: Config
     seeds: Sequence["SeedRecorder"]
-    evaluate: Callable[[PolicyParams], Summary]
+    evaluate: Callable[[PolicyParams], Summary | ReturnSummary]
     video: "EvaluationVideo | None"
     terminal: Terminal
     say: Callable[[str], None]
@@ -132,11 +136,17 @@ class RunRecorder(TrainerCallback, contextlib.AbstractContextManager["RunRecorde
 
     @property
     def complete(self) -> bool:
-        """Return whether every seed has made all its steps, or reached `stop_at_success`."""
-        ppo, target = self.config.ppo, self.config.stop_at_success
+        """Return whether every seed has made all its steps, or is as good as was asked for."""
+        ppo, config = self.config.ppo, self.config
         return all(
             one.env_steps >= ppo.training_steps * ppo.steps_per_training_step
-            or (target is not None and one.last is not None and one.last.success_rate >= target)
+            or (
+                one.last is not None
+                and (
+                    _reaches(one.last.success_rate, config.stop_at_success)
+                    or _reaches(one.last.episode_return, config.stop_at_return)
+                )
+            )
             for one in self.standings
         )
 
@@ -308,7 +318,11 @@ class SeedRecorder:
         self._store = CheckpointStore(self.run_dir, self.config.checkpoints_to_keep)
 
     def report(
-        self, progress: Progress, summary: Summary, metrics: MetricValues, wall_seconds: float
+        self,
+        progress: Progress,
+        summary: Summary | ReturnSummary,
+        metrics: MetricValues,
+        wall_seconds: float,
     ) -> None:
         """Log the metrics, then save: a checkpoint is never newer than the log.
 
@@ -320,21 +334,28 @@ class SeedRecorder:
         """
         standing = self.standing
         standing.env_steps, standing.last = progress.env_steps, summary
-        if standing.best is None or summary.success_rate >= standing.best.success_rate:
+        if standing.best is None or summary.score >= standing.best.score:
             standing.best_steps, standing.best = progress.env_steps, summary
         with runs.writing_to(self.run_dir):
             for sink in self.sinks:
                 sink.write(progress.env_steps, metrics)
-        self.save(progress, summary._asdict(), wall_seconds)
+        self.save(progress, summary._asdict(), wall_seconds, summary.score)
         self.fingerprint = runs.digest(progress.params)
 
-    def save(self, progress: Progress, evaluation: MetricValues, wall_seconds: float) -> None:
+    def save(
+        self,
+        progress: Progress,
+        evaluation: MetricValues,
+        wall_seconds: float,
+        score: float | None = None,
+    ) -> None:
         """Begin to write a checkpoint.
 
         Args:
           progress: the progress of this seed.
           evaluation: the metrics of the policy; empty if it was not evaluated.
           wall_seconds: time of all processes that worked on the run [s].
+          score: the number by which the best checkpoint is found; None if it was not evaluated.
         """
         self.standing.wall_seconds = wall_seconds
         trees = runs.to_trees(progress.state) if progress.state else {runs.POLICY: progress.params}
@@ -343,10 +364,9 @@ class SeedRecorder:
             "metrics": dict(evaluation),
             "progress": self.standing.to_json(),
         }
-        success = evaluation.get("success_rate")
         # Other programs may read the policy, array by array, but not the rest.
         joined = trees.keys() - {runs.POLICY}
-        self._store.save(progress.env_steps, trees, about, success, joined)
+        self._store.save(progress.env_steps, trees, about, score, joined)
 
     def render(self, video: "EvaluationVideo", progress: Progress) -> None:
         """Render a video of the policy into the run folder, and log it."""

@@ -22,8 +22,17 @@ from jaxtyping import Array, UInt32
 from jetbot_mjx import envs, runs
 from jetbot_mjx.agents import PPO, PolicyParams, TrainState
 from jetbot_mjx.config import Config, ConfigError
+from jetbot_mjx.envs import AdaptedEnv
 from jetbot_mjx.errors import UserError, ran_out
-from jetbot_mjx.evaluation import Evaluator, Summary, summarize, training_keys
+from jetbot_mjx.evaluation import (
+    Evaluator,
+    ReturnEvaluator,
+    ReturnSummary,
+    Summary,
+    summarize,
+    summarize_returns,
+    training_keys,
+)
 from jetbot_mjx.fallbacks import Fallback, collect
 from jetbot_mjx.interrupts import tell
 from jetbot_mjx.runs import CompileClock, Resumption, Setup, TaskCode, WarmStart, checkpoint_steps
@@ -54,10 +63,10 @@ class Result(NamedTuple):
     """Time spent on the training, in all processes [s]."""
 
     def __repr__(self) -> str:
-        """Return the folder and the best success rate of each seed in one line."""
-        rates = [f"{one.best.success_rate:.1%}" if one.best else "-" for one in self.standings]
+        """Return the folder and the best evaluation of each seed in one line."""
+        scores = [told_score(one.best) if one.best else "-" for one in self.standings]
         return (
-            f"Result(run_dir={str(self.run_dir)!r}, success={' '.join(rates) or '-'},"
+            f"Result(run_dir={str(self.run_dir)!r}, best={', '.join(scores) or '-'},"
             f" finished={self.finished})"
         )
 
@@ -67,7 +76,7 @@ class Result(NamedTuple):
         return runs.read_history(self.run_dirs[0] / runs.METRICS)
 
     @property
-    def best(self) -> Summary:
+    def best(self) -> Summary | ReturnSummary:
         """Return the metrics of the first seed's best checkpoint."""
         assert self.standings[0].best is not None
         return self.standings[0].best
@@ -95,6 +104,8 @@ class Training:
     """Parts that run slower than they could; others are added while programs are traced."""
     task_code: TaskCode | None = None
     """The source of the task that the run stores; None: it has none, or it is stored already."""
+    hints: Sequence[str] = ()
+    """Settings without which a robot of a user's own may not learn."""
     verbose: bool = True
     """Whether to show the progress."""
 
@@ -137,6 +148,7 @@ def run(
         written; the task cannot be built; the environments cannot be divided among the devices,
         the CPU is divided otherwise, or the devices have too little memory.
     """
+    keep = programs is not None
     if programs is None:
         programs = envs.open_program_cache(config, keep=False)
     if programs.loads:
@@ -151,7 +163,7 @@ def run(
     runs.check_tracking(config)
     # Build every object once, and train.
     with collect() as fallbacks:
-        training = _compose(config, run_dir, programs, fallbacks, verbose=verbose)
+        training = _compose(config, run_dir, programs, fallbacks, keep=keep, verbose=verbose)
         try:
             if config.trainer == "brax":
                 result = _train_with_brax(training)
@@ -175,14 +187,21 @@ def _compose(
     programs: ProgramCache,
     fallbacks: Sequence[Fallback],
     *,
+    keep: bool,
     verbose: bool,
 ) -> Training:
     """Build every object of a training once."""
     run_dirs = runs.seed_dirs(run_dir, config)
-    task_class, task_code = _find_task(config.task.name, run_dirs)
-    setup = Setup(config, programs, task_class=task_class)
-    if not envs.is_built_in(config.task.name):
+    own_class, task_code = _find_code(config.code, run_dirs)
+    setup = Setup(config, programs, own_class=own_class)
+    if isinstance(setup.env, AdaptedEnv):
+        _check_targets(config, setup.env)
+    elif not envs.is_built_in(config.task.name):
         envs.require_trainable(setup.env.task, config)
+    if keep and not envs.is_built_in(config.code):
+        # Only now it is known what the programs depend on.
+        setup.programs = envs.open_program_cache(config, own=envs.own_fingerprint(setup.env))
+    hints = [] if isinstance(setup.env, AdaptedEnv) else envs.training_hints(setup.env)
     ppo = ppo_trainer.build_ppo(setup)
     # Another run's policy is loaded only for a run without checkpoints of its own.
     warm_start = None
@@ -196,6 +215,7 @@ def _compose(
         warm_start=warm_start,
         fallbacks=fallbacks,
         task_code=task_code,
+        hints=hints,
         verbose=verbose,
     )
 
@@ -208,13 +228,20 @@ def _has_checkpoints(run_dirs: Sequence[Path]) -> bool:
         return False
 
 
-def _find_task(
-    name: str, run_dirs: Sequence[Path]
-) -> tuple[type[envs.Task] | None, TaskCode | None]:
-    """Return the class of the run's task if the run stores it, or its source if it is to be stored.
+def _check_targets(config: Config, env: AdaptedEnv) -> None:
+    """Raise an error if a training could never end as it is told to."""
+    if config.stop_at_success is not None and not env.has_success:
+        raise UserError(
+            f"stop_at_success = {config.stop_at_success}: environment = {config.environment!r} has"
+            " no metric 'success': use stop_at_return, or leave it out"
+        )
 
-    A run that has checkpoints continues with the task that it was begun with. Of several processes,
-    all train the task of the first one, which sends its source to those that lack it.
+
+def _find_code(name: str, run_dirs: Sequence[Path]) -> tuple[type | None, TaskCode | None]:
+    """Return the class of the task or the environment if the run stores it, or its source to store.
+
+    A run that has checkpoints continues with the code that it was begun with. Of several processes,
+    all train with that of the first one, which sends its source to those that lack it.
     """
     primary = distributed.is_primary()
     resumes = primary and _has_checkpoints(run_dirs)
@@ -223,12 +250,12 @@ def _find_task(
         return runs.read_task_code(run_dirs[0]) if resumes else runs.collect_task_code(name)
 
     sent = distributed.broadcast_from_primary(source) if jax.process_count() > 1 else None
-    task_class = runs.stored_task_class(run_dirs[0], name) if resumes else None
+    own_class = runs.stored_class(run_dirs[0], name) if resumes else None
     if sent and not primary:
         with tempfile.TemporaryDirectory() as folder:
             runs.write_task_code(Path(folder), sent)
-            task_class = runs.stored_task_class(Path(folder), name, silent=True)
-    return task_class, None if task_class else runs.collect_task_code(name)
+            own_class = runs.stored_class(Path(folder), name, silent=True)
+    return own_class, None if own_class else runs.collect_task_code(name)
 
 
 def _store_run(training: Training) -> None:
@@ -362,14 +389,13 @@ def open_recorder(
     return RunRecorder(config, seeds, evaluate, video, terminal, say, clock)
 
 
-def _evaluation(setup: Setup) -> Callable[[PolicyParams], Summary]:
-    """Return a function that evaluates a policy on the fixed goals of training.
+def _evaluation(setup: Setup) -> Callable[[PolicyParams], Summary | ReturnSummary]:
+    """Return a function that evaluates a policy on the fixed goals or starts of training.
 
     The robots vary as in training.
     """
-    env, programs = setup.env, setup.programs
-    evaluator = Evaluator(envs.maybe_randomize(env), setup.networks, programs)
-    episodes = setup.config.evaluation.episodes
+    programs, episodes = setup.programs, setup.config.evaluation.episodes
+    evaluator, summary_of = _evaluator(setup)
 
     @functools.cache
     def keys() -> UInt32[Array, "n 2"]:
@@ -377,12 +403,24 @@ def _evaluation(setup: Setup) -> Callable[[PolicyParams], Summary]:
         jitted = jax.jit(training_keys, static_argnums=0)
         return programs.compile(f"{episodes} keys", lambda: jitted.trace(episodes))()
 
-    def evaluate(params: PolicyParams) -> Summary:
+    def evaluate(params: PolicyParams) -> Summary | ReturnSummary:
         # Draw the keys while XLA compiles the episodes.
         evaluator.prepare(params, episodes)
-        return summarize(evaluator.run(params, keys()), env.dt)
+        return summary_of(evaluator.run(params, keys()))
 
     return evaluate
+
+
+def _evaluator(
+    setup: Setup,
+) -> tuple[Evaluator | ReturnEvaluator, Callable[..., Summary | ReturnSummary]]:
+    """Return what runs the episodes of a setup, and what summarises them."""
+    env = setup.env
+    if isinstance(env, AdaptedEnv):
+        evaluator = ReturnEvaluator(env, setup.networks, setup.programs)
+        return evaluator, functools.partial(summarize_returns, has_success=env.has_success)
+    evaluator = Evaluator(envs.maybe_randomize(env), setup.networks, setup.programs)
+    return evaluator, functools.partial(summarize, ctrl_dt=env.dt)
 
 
 def _check_folder(training: Training) -> bool:
@@ -455,7 +493,9 @@ def _complete_message(config: Config, standings: Sequence[Standing]) -> str:
     """Return the line about a run that has nothing left to train, and how to train it further."""
     steps = min(standing.env_steps for standing in standings)
     planned = config.ppo.training_steps * config.ppo.steps_per_training_step
-    setting = "ppo.num_timesteps" if steps >= planned else "stop_at_success"
+    setting = "ppo.num_timesteps"
+    if steps < planned:
+        setting = "stop_at_return" if config.stop_at_success is None else "stop_at_success"
     return f"complete after {steps:,} steps; raise {setting} to train further"
 
 
@@ -463,15 +503,30 @@ def _headline(training: Training) -> str:
     config, device = training.config, jax.devices()[0]
     hosts = f" of {jax.process_count()} processes" if jax.process_count() > 1 else ""
     seeds = f", {config.seeds} seeds at once" if config.seeds > 1 else ""
-    robot, *measures = config.robot.label.partition(" with ")
-    hints = "".join(f"\nhint: {one}" for one in envs.training_hints(training.setup.env))
+    env = training.setup.env
+    if isinstance(env, AdaptedEnv):
+        actions = "choices" if env.is_discrete else "actions"
+        what = f"{config.code} ({env.observation_size} observations, {env.action_size} {actions})"
+    else:
+        robot, *measures = config.robot.label.partition(" with ")
+        what = (
+            f"{config.task.name} ({robot} robot{''.join(measures)},"
+            f" {config.task.observation} observation)"
+        )
+    hints = "".join(f"\nhint: {one}" for one in training.hints)
     return (
-        f"training {config.task.name} ({robot} robot{''.join(measures)},"
-        f" {config.task.observation} observation) with the {config.trainer} trainer:"
+        f"training {what} with the {config.trainer} trainer:"
         f" {config.ppo.num_timesteps:,} steps in {config.ppo.num_envs:,} environments{seeds} on"
         f" {jax.device_count()} x {device.device_kind}{hosts}\nrun folder: {training.run_dir}"
         f"{hints}"
     )
+
+
+def told_score(best: Summary | ReturnSummary) -> str:
+    """Return in words the number by which the best checkpoint was found."""
+    if best.success_rate is None:
+        return f"return {best.episode_return:.1f}"
+    return f"{best.success_rate:.1%} success"
 
 
 def stop_message(run: Training | Result) -> str:
@@ -495,18 +550,20 @@ def summary(result: Result) -> str:
         assert standing.best is not None
         seed = f"{folder.name}, " if folder != result.run_dir else ""
         lines.append(
-            f"{seed}best policy: {standing.best.success_rate:.1%} success at"
+            f"{seed}best policy: {told_score(standing.best)} at"
             f" {standing.best_steps:,} steps; last parameters: sha256 {fingerprint}"
         )
     if len(lines) > 1:
         # Its statistics take half a second to import.
         from jetbot_mjx.evaluation import bootstrap
 
-        rates = [standing.best.success_rate for standing in result.standings if standing.best]
-        over_seeds = bootstrap(np.mean, rates)
+        best = [standing.best for standing in result.standings if standing.best]
+        form = "{:.2%}" if best[0].success_rate is not None else "{:.1f}"
+        over_seeds = bootstrap(np.mean, [one.score for one in best])
+        value, low, high = map(form.format, (over_seeds.value, over_seeds.low, over_seeds.high))
+        what = "success" if best[0].success_rate is not None else "return"
         lines.append(
-            f"{len(lines)} seeds: {over_seeds.value:.2%} success in the mean"
-            f" (95 % interval {over_seeds.low:.2%} .. {over_seeds.high:.2%})"
+            f"{len(lines)} seeds: {value} {what} in the mean (95 % interval {low} .. {high})"
         )
     first = shlex.quote(str(result.run_dirs[0]))
     lines += [

@@ -72,7 +72,7 @@ class Trials:
         if config.init_from is not None:
             self._warm_start = make_warm_start(load_checkpoint(config.init_from), setup)
         episodes = rollout_fn(
-            maybe_randomize(setup.env),
+            maybe_randomize(setup.robot_env),
             [policy_controller(self._networks)],
             config.task.episode_length,
         )

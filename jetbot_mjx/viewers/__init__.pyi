@@ -11,4 +11,5 @@ from .mujoco_window import require_window as require_window
 from .offscreen import Renderer as Renderer
 from .offscreen import overview as overview
 from .player import Player as Player
+from .step_fns import move_goal_error as move_goal_error
 from .video import EvaluationVideo as EvaluationVideo

@@ -100,7 +100,7 @@ def render_run(
     # Run the episodes.
     checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
     setup = checkpoint.make_setup()
-    env = setup.env
+    env = setup.robot_env
     rolled_out = run_episodes([checkpoint], setup, goals)[0]
     folder = checkpoint.results_dir / "videos" / checkpoint.path.name
     files = video_files(folder, names[0]) | {"plot": folder / f"{names[1]}.png"}
@@ -138,7 +138,7 @@ def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> 
     chosen = early_middle_final(runs.checkpoint_steps(path))
     checkpoints = [runs.load_checkpoint(path, one) for one in chosen]
     setup = checkpoints[0].make_setup()
-    env, goals = setup.env, range(episodes)
+    env, goals = setup.robot_env, range(episodes)
     rolled_out = run_episodes(checkpoints, setup, goals)
     name = evaluation.name_with_count("gallery", episodes, GALLERY_EPISODES)
     files = video_files(path / "videos", name) | {"plots": path / "videos" / f"{name}.png"}
@@ -203,7 +203,7 @@ def run_episodes(
     Returns:
       The episodes of each policy, on the host.
     """
-    evaluator = evaluation.Evaluator(setup.env, setup.networks, setup.programs, record=True)
+    evaluator = evaluation.Evaluator(setup.robot_env, setup.networks, setup.programs, record=True)
     keys = evaluation.report_keys(max(goals) + 1)[np.asarray(goals)]
     return [jax.device_get(evaluator.run(each.params, keys)) for each in checkpoints]
 

@@ -60,7 +60,7 @@ def render_many(
     # Run the episodes.
     checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
     setup = checkpoint.make_setup()
-    env = setup.env
+    env = setup.robot_env
     grid = place_on_grid(env, run_episodes([checkpoint], setup, range(robots))[0])
     folder = checkpoint.results_dir / "videos" / checkpoint.path.name
     files = video_files(folder, f"many-{robots}")
@@ -97,11 +97,11 @@ def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
     check_count("robots", robots, MOST_ROBOTS)
     # Choose the checkpoints and run them on the same goals.
     path = run_folder(run_dir, "--strip")
-    rates = {step: runs.stored_success_rate(path, step) for step in runs.checkpoint_steps(path)}
+    rates = {step: runs.stored_score(path, step) for step in runs.checkpoint_steps(path)}
     chosen = untrained_early_trained(rates)
     checkpoints = [runs.load_checkpoint(path, step) for step in chosen.values()]
     setup = checkpoints[0].make_setup()
-    env = setup.env
+    env = setup.robot_env
     grids = [
         place_on_grid(env, each, aspect=1.0, spacing=_STRIP_SPACING)
         for each in run_episodes(checkpoints, setup, range(robots))

@@ -64,7 +64,7 @@ class Player:
         self.agent = agent
         """The agent that drives, one of `AGENTS`."""
         checkpoint = load_checkpoint(run_or_checkpoint, which)
-        self.env = checkpoint.make_env()
+        self.env = checkpoint.make_setup().robot_env
         self.run_dir = checkpoint.run_dir
         self.paused = False
         self.successes = 0

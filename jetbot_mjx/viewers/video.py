@@ -318,8 +318,8 @@ class EvaluationVideo:
         Args:
           setup: the environment, networks and programs of the training.
         """
-        self._env = setup.env
-        self._evaluator = Evaluator(setup.env, setup.networks, setup.programs, record=True)
+        self._env = setup.robot_env
+        self._evaluator = Evaluator(setup.robot_env, setup.networks, setup.programs, record=True)
 
     def write(self, path: Path, params: PolicyParams, env_steps: int) -> None:
         """Run the episodes and write their video, and a GIF of the same name.

@@ -4,6 +4,7 @@ from onekernel import cpu, gpu, wasm
 from onekernel.backends import BACKENDS
 from onekernel.background import in_background
 from onekernel.codegen import LlvmWriter, Repeat, Value, run_program
+from onekernel.fingerprint import fingerprint
 from onekernel.kernel import Backend, make_primitive
 from onekernel.lower import (
     ScalarProgram,
@@ -21,6 +22,7 @@ __all__ = [
     "Value",
     "cpu",
     "evaluate",
+    "fingerprint",
     "gpu",
     "in_background",
     "make_primitive",

@@ -18,7 +18,7 @@ from helpers.gymnasium_cases import ENDS, GOAL, ID, sees
 from jetbot_mjx.adapters import JetBotGymEnv, JetBotVectorEnv
 from jetbot_mjx.adapters.base import observation_space
 from jetbot_mjx.config import Config, parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.task import GOAL_HEIGHT
 from jetbot_mjx.errors import UserError
 

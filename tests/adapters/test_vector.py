@@ -16,7 +16,7 @@ from helpers.gymnasium_cases import ENDS, GOAL, ID, sees
 from jetbot_mjx.adapters import JetBotGymEnv, JetBotVectorEnv
 from jetbot_mjx.adapters.arguments import key_from_seed
 from jetbot_mjx.config import load_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
 

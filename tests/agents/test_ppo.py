@@ -26,7 +26,8 @@ from jetbot_mjx.agents import loss
 from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.agents.train_state import LOSSES
 from jetbot_mjx.config import load_config, parse_config
-from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.build import make_env
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.task import EGOCENTRIC, LAYOUTS, Field, GoalTask
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError

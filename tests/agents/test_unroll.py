@@ -12,7 +12,7 @@ from jetbot_mjx.agents.fused import launch
 from jetbot_mjx.agents.fused.arrays import UNROLL
 from jetbot_mjx.agents.fused.shapes import Unroll
 from jetbot_mjx.config import load_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.packed import pack
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.training.ppo_trainer import build_ppo

@@ -285,3 +285,55 @@ def test_it_says_what_a_page_cannot_train(changes, sizes, reason):
     found = web_learner(config(**changes).ppo, *sizes)
     assert isinstance(found, str)
     assert reason in found
+
+
+SEE = """
+const memory = new Memory(await WebAssembly.compile(given.module));
+const { images, policy, count, features } = given, found = new Float32Array(count * features);
+const network = new Network(memory, policy, count);
+network.encoder.look({ bytes: images, size: images.length / count }, found, features);
+return found;
+"""
+
+
+def test_an_encoder_of_any_size_is_applied_as_jax_does():
+    # Channels that fill no vector, and more images than are encoded at once.
+    rng, count, shape = np.random.default_rng(0), 37, (11, 14, 3)
+    sizes = [(4, 2, 6), (3, 1, 5)]
+    images = rng.integers(0, 256, (count, *shape), np.uint8)
+    x, convolutions, channels = np.float32(images), [], shape[-1]
+    for side, stride, outputs in sizes:
+        kernel = np.float32(rng.normal(size=(side, side, channels, outputs)) / 50)
+        bias = np.float32(rng.normal(size=outputs))
+        with jax.default_matmul_precision("highest"):
+            x = jax.lax.conv_general_dilated(
+                x, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+            )
+        x, channels = np.maximum(np.asarray(x) + bias, 0), outputs
+        layer = {"kernel": kernel.ravel(), "bias": bias, "side": side, "stride": stride}
+        convolutions.append(layer)
+    x = x.reshape(count, -1)
+    dense = np.float32(rng.normal(size=(x.shape[1], 7)) / 10)
+    bias = np.float32(rng.normal(size=7))
+    expected = np.maximum(x @ dense + bias, 0)
+    assert (expected > 0).mean() > 0.3
+    policy = {
+        "mean": np.zeros(0, np.float32),
+        "std": np.zeros(0, np.float32),
+        "squash": True,
+        "layers": [{"kernel": np.zeros(14, np.float32), "bias": np.zeros(2, np.float32)}],
+        "encoder": {
+            "shape": shape,
+            "convolutions": convolutions,
+            "dense": {"kernel": dense.ravel(), "bias": bias},
+        },
+    }
+    found = node.run(
+        SEE,
+        module=linked({**network_texts("tanh")}),
+        images=images.ravel(),
+        policy=policy,
+        count=count,
+        features=7,
+    )
+    np.testing.assert_allclose(found.reshape(expected.shape), expected, rtol=1e-4, atol=1e-4)

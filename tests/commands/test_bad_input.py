@@ -16,7 +16,7 @@ from helpers.damage import damage_about
 from helpers.tensorboard_files import read_events
 from jetbot_mjx import cli, devices
 from jetbot_mjx.config import load_config, parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.metrics import TensorBoardSink

@@ -30,7 +30,7 @@ from jetbot_mjx.deployment.numpy_policy import (
     record,
 )
 from jetbot_mjx.deployment.policy_spec import policy_spec
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import InvalidError, MissingPackageError, UserError
 from jetbot_mjx.evaluation.evaluator import report_keys

@@ -14,7 +14,7 @@ import jetbot_mjx
 from jetbot_mjx import __main__ as entry
 from jetbot_mjx import cli
 from jetbot_mjx.config import load_config, parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.terminal import progress
 

@@ -176,6 +176,11 @@ BAD_VALUES = {
         "robot.wheels.left = ['l'] is unknown",
         "only a robot that is a MuJoCo model has it, of robot.file: NAME.xml",
     ),
+    "a camera of the robot": (
+        "robot: {preset: real, camera: {pitch: 15.0}}",
+        "robot.camera.pitch = 15.0 is unknown",
+        "camera is a section of its own, beside robot",
+    ),
     "schedule upside down": (
         "ppo: {learning_rate_schedule: ADAPTIVE_KL, learning_rate_schedule_min_lr: 0.02}",
         "[0.02, 0.01]",

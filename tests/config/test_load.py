@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from jetbot_mjx.config import Config, ConfigError, load_config, parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.errors import UserError
 
 CONFIGS = sorted(Path(__file__).parents[2].joinpath("configs").glob("*.yaml"))

@@ -143,6 +143,7 @@ def test_impossible_measures_are_refused_in_one_line(robot, said):
         ("wheel_radius: 33", "mine.yaml: robot.wheel_radius = 33 is wrong"),
         ("wheel_radus: 0.03", "mine.yaml: robot.wheel_radus = 0.03 is unknown"),
         ("file: other.yaml", "mine.yaml: file = 'other.yaml': it is one itself"),
+        ("robot: {preset: real}", "mine.yaml: it has a section robot, as a configuration has"),
         ("camera: 3", "camera = 3 is not a section"),
         ("- 1", "holds [1]: write `key: value` lines"),
         (None, "mine.yaml does not exist"),

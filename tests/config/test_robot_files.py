@@ -49,6 +49,7 @@ def test_the_hash_is_of_all_of_them(model):
         ('<robot name="r"/>', "this is URDF, which has no motors: make MJCF of it in Python"),
         ("<mujoco>", "this is not XML: no element found"),
         (" \n", "it is empty"),
+        ('<mujoco><geom pos="0 -NaN 0"/></mujoco>', "<geom pos='0 -NaN 0'> holds NaN: give a"),
         (b"\xff\xfe<\0", "this is not UTF-8 text, as MJCF is"),
     ],
 )
@@ -64,6 +65,11 @@ def test_what_is_no_model_is_refused_in_one_line(model, text, said):
 def test_a_model_that_includes_itself_ends(model):
     model.write_text('<mujoco><include file="model.xml"/></mujoco>')
     assert set(model_files(register(model))) == {"model.xml"}
+
+
+def test_a_part_may_be_called_nan(model):
+    model.write_text('<mujoco><joint name="nan"/><velocity joint="nan"/></mujoco>')
+    assert register(model)
 
 
 def test_large_models_are_refused(model, monkeypatch):

@@ -10,10 +10,10 @@ import pytest
 
 from jetbot_mjx import new_task
 from jetbot_mjx.config import load_config, parse_config, shipped_configs, task_modules
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import task_code
-from jetbot_mjx.runs.task_code import collect_task_code, stored_task_class, write_task_code
+from jetbot_mjx.runs.task_code import collect_task_code, stored_class, write_task_code
 
 TASK = """
 from jetbot_mjx import GoalTask
@@ -171,6 +171,6 @@ def test_an_example_in_an_installed_package_is_stored_in_its_run(tmp_path, root,
     assert [path for path, _ in code.files] == ["gates_task.py"]
     write_task_code(tmp_path, code)
     shutil.rmtree(examples)
-    found = stored_task_class(tmp_path, config.task.name, silent=True)
+    found = stored_class(tmp_path, config.task.name, silent=True)
     assert found is not None
     assert found.__name__ == "GatesTask"

@@ -16,9 +16,9 @@ from jetbot_mjx.deployment.drive_pictures import picture_strip
 from jetbot_mjx.deployment.policy_spec import _image
 from jetbot_mjx.deployment.simulated_camera import CameraModel, camera_config
 from jetbot_mjx.deployment.simulated_jetbot import MotorModel, SimulatedJetBot
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.camera import lens
 from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 
 ROOT = Path(__file__).parents[2]

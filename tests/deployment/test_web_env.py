@@ -338,3 +338,36 @@ def test_the_camera_sees_what_the_packages_does_and_the_policy_acts_on_it(name):
     given = (x.reshape(steps * count, *x.shape[2:]) for x in (ours, *numbers.values()))
     expected, _ = jax.jit(as_jax(page.checkpoint, env))(*given)
     np.testing.assert_allclose(actions, expected.reshape(actions.shape), rtol=0, atol=1e-4)
+
+
+LOOK = f"""{BEGIN}
+const policy = policyOf(given.data.policies[given.data.policies.length - 1]);
+fleet.drivenBy(policy);
+for (let step = 0; step < 3; step++) fleet.step();
+const image = (_, robot) => [...fleet.image(robot)];
+const all = () => Uint8Array.from(Array.from({{ length: count }}, image).flat());
+const seen = {{ images: all(), bytes: fleet.eyes.bytes.slice() }};
+// Nobody looks while others drive, but the image of a robot is that of now.
+fleet.drivenBy(null);
+fleet.scripted = true;
+for (let step = 0; step < 9; step++) fleet.step();
+const blind = {{ images: all(), bytes: fleet.eyes.bytes.slice() }};
+fleet.drivenBy(policy);
+return {{ seen, blind, back: fleet.eyes.bytes.slice() }};
+"""
+
+
+@pytest.mark.parametrize("name", slow_unless(lambda name: name == "camera_real", CAMERAS))
+def test_a_policy_that_takes_over_sees_what_is_there_now(name):
+    page, count = shipped(name), 5
+    found = page.run(LOOK, keys=np.asarray(report_keys(count)).ravel())
+    about = page.data["meta"]["image"]
+    pixels = about["height"] * about["width"]
+    stack = (count, pixels, about["frames"], about["channels"])
+    seen, blind = found["seen"], found["blind"]
+    images = seen["images"].reshape(count, pixels, -1)
+    np.testing.assert_array_equal(images, seen["bytes"].reshape(stack)[:, :, -1])
+    np.testing.assert_array_equal(blind["bytes"], seen["bytes"])
+    images = blind["images"].reshape(count, pixels, 1, -1)
+    assert np.abs(images[:, :, 0].astype(int) - seen["bytes"].reshape(stack)[:, :, -1]).max() > 50
+    np.testing.assert_array_equal(found["back"].reshape(stack), images.repeat(stack[2], axis=2))

@@ -132,6 +132,24 @@ class RememberingTask(GoalTask):
 """
 
 
+FIXED = """
+import jax.numpy as jnp
+from typing import NamedTuple
+from jetbot_mjx.envs import GoalTask
+
+class Place(NamedTuple):
+    position: jnp.ndarray
+    radius: jnp.ndarray
+
+class FixedTask(GoalTask):
+    def sample(self, key):
+        return Place(super().sample(key), jnp.float32(0.1))
+
+    def goal_position(self, goal):
+        return goal.position
+"""
+
+
 def own_task(folder, source, name):
     """The configuration of a task that is written beside it."""
     (folder / f"{name.lower()}_of_mine.py").write_text(source)
@@ -152,6 +170,20 @@ def test_a_task_that_reads_its_settings_as_plain_numbers_has_no_knobs(tmp_path):
     episodes, successes = page.run(body)
     assert episodes >= 64
     assert successes > 0.9 * episodes
+
+
+def test_a_goal_that_its_task_cannot_move_stays(tmp_path):
+    # The task inherits a `move_goal` for goals that are positions.
+    page = linked_page(tmp_path / "run", own_task(tmp_path, FIXED, "FixedTask"))
+    assert "move" not in page.data["meta"]["robot_functions"]["functions"]
+    body = """
+    const fleet = engine.fleet(9, 0), before = fleet.goals().slice();
+    fleet.setGoal(4, 1, 1);
+    return { before, after: fleet.goals() };
+    """
+    found = page.run(body)
+    np.testing.assert_array_equal(found["after"], found["before"])
+    assert np.ptp(found["before"]) > 0.5
 
 
 @pytest.mark.slow

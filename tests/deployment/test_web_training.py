@@ -11,11 +11,13 @@ import pytest
 from brax.training.acme import running_statistics
 
 import jetbot_mjx
+from helpers import node
 from helpers.source_tree import ROOT
 from helpers.web_pages import shipped
 from jetbot_mjx.agents.fused import arrays, launch
 from jetbot_mjx.agents.fused.learner import FusedLearner, shape_of
 from jetbot_mjx.envs import wrap_for_training
+from jetbot_mjx.evaluation.evaluator import wilson_interval
 from onekernel import cpu
 
 sys.path.append(str(ROOT / "deploy"))
@@ -342,6 +344,14 @@ def test_a_training_is_paused_goes_on_and_takes_what_a_visitor_changes(training,
     assert low < told[0]["success"] < high
     # Every robot is within 50 m of its goal.
     assert told[-1]["success"] == 1
+
+
+def test_the_interval_of_a_page_is_the_packages():
+    cases = [(0, 60), (60, 60), (253, 256), (1, 2)]
+    found = node.run("return given.cases.map(([a, b]) => wilson(a, b));", cases=cases)
+    for (successes, count), (low, high) in zip(cases, found, strict=True):
+        assert 0 <= low < high <= 1
+        np.testing.assert_allclose((low, high), wilson_interval(successes, count), atol=1e-5)
 
 
 @pytest.mark.slow

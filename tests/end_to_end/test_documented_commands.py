@@ -21,7 +21,7 @@ from jetbot_mjx import plan
 from jetbot_mjx.agents import NanDump
 from jetbot_mjx.config import load_config
 from jetbot_mjx.deployment.simulated_jetbot import SimulatedJetBot
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.runs.nan_dump import save_nan_dump
 from jetbot_mjx.viewers import mujoco_window

@@ -4,7 +4,7 @@ import jax
 import pytest
 
 from jetbot_mjx.config import load_config, shipped_configs
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.fallbacks import collect
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer, build_ppo

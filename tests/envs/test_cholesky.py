@@ -9,7 +9,7 @@ import pytest
 from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import mjx
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 
 CALLS = "potrf", "trsm", "stablehlo.cholesky", "stablehlo.triangular_solve"
 ROBOTS, STEPS = 24, 16

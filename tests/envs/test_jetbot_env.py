@@ -12,7 +12,7 @@ from helpers.command_modules import train
 from jetbot_mjx import load_policy
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.devices import require_device
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.envs.task import layout_size
 from jetbot_mjx.errors import UserError

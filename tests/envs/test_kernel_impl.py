@@ -7,7 +7,7 @@ import pytest
 
 from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.kernel_impl import KernelImpl
 from jetbot_mjx.errors import UserError
 from onekernel import KernelError, UnsupportedError, cpu, gpu

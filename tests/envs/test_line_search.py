@@ -12,7 +12,7 @@ from mujoco.mjx._src import forward, solver
 
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import line_search, mjx
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.state import PhysicsState
 

@@ -195,6 +195,14 @@ def test_an_own_function_drives_all_actuators(own_drive):
     [
         ("def controls(action): return action[:3]", "returns the shape [3]: the model has 4"),
         ("def control(action): return action", "AttributeError: module 'wheels' has no attribute"),
+        (
+            "import numpy as np\ndef controls(action): return np.asarray(action)",
+            "'wheels.py:controls' is not written in JAX (TracerArrayConversionError): take",
+        ),
+        (
+            "def controls(action): return action if action[0] > 0 else -action",
+            "is not written in JAX (TracerBoolConversionError)",
+        ),
         ("import nothing_like_it", "ModuleNotFoundError: No module named 'nothing_like_it'"),
         ("raise SystemExit(0)", "robot.drive = 'wheels.py:controls': SystemExit: 0"),
         (

@@ -8,8 +8,8 @@ import pytest
 
 from jetbot_mjx.config import RandomizationConfig, RobotParams, load_config, parse_config
 from jetbot_mjx.envs import mujoco_simulator
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.mujoco_simulator import in_mujoco, make_model, training_numerics
 from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.wrappers import EpisodeWrapper

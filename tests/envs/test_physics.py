@@ -15,7 +15,7 @@ from helpers import motion
 from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import kinematics, mjx
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.state import PhysicsState
 from onekernel import cpu, gpu

@@ -137,3 +137,13 @@ def test_a_robot_that_leans_is_refused():
     casters = [{"x": -0.082, "y": 0.0, "radius": 0.01, "clearance": 0.03}]
     with pytest.raises(UserError, match=r"leans 2.° to the rear: support it there"):
         make_mj_model(RobotConfig(preset="real", casters=casters), PhysicsConfig())
+
+
+def test_a_robot_that_sways_for_longer_is_waited_for():
+    top_heavy = RobotConfig(preset="real", chassis_com=(-0.03, 0.0, 0.5))
+    assert make_mj_model(top_heavy, PhysicsConfig()).qpos0[2] == pytest.approx(0.03, abs=1e-3)
+
+
+def test_motors_that_are_unstable_are_told_with_what_would_help():
+    with pytest.raises(UserError, match=r"stable below 6.3e-06 s: make robot.motor_gain smaller"):
+        make_mj_model(RobotConfig(preset="real", motor_gain=100.0), PhysicsConfig())

@@ -14,8 +14,8 @@ from helpers.own_robots import load_robot
 from jetbot_mjx.config import RobotParams, parse_config
 from jetbot_mjx.devices import compiler_options
 from jetbot_mjx.envs import kinematics, mjx
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.domain_randomization import LARGEST_TRACED, DomainRandomizationWrapper
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.robot_params import vary_model, vary_own_model
 from jetbot_mjx.envs.robot_trial import drive_trial

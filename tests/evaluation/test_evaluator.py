@@ -8,7 +8,7 @@ from scipy import stats
 
 from helpers.gliding import Gliding
 from jetbot_mjx.config import parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.evaluation.evaluator import (
     BASELINES,
     Evaluator,

@@ -9,8 +9,8 @@ import pytest
 from helpers import gliding
 from jetbot_mjx.agents.networks import PolicyParams, make_networks
 from jetbot_mjx.config import LookParams, PPOConfig, RobotParams, parse_config
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.domain_randomization import LARGEST_TRACED, DomainRandomizationWrapper
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.evaluation import robustness
 from jetbot_mjx.evaluation.evaluator import Summary, report_keys, wilson_interval
 from jetbot_mjx.evaluation.plots import plot_robustness

@@ -123,7 +123,7 @@ BROKEN = {
                 '<equality><joint joint1="left_wheel" joint2="right_wheel"/></equality></mujoco>',
             ),
         ),
-        "told to turn half as fast as it may, it turns with",
+        "told to turn half as fast as it may, it turns",
     ),
     "millimetres": Broken(
         "turtlebot",
@@ -197,6 +197,87 @@ BROKEN = {
     "a car without steering": Broken(
         "car", (), "a car has actuators in robot.wheels and in robot.steering", {"steering": None}
     ),
+    "a number that is none": Broken(
+        "turtlebot",
+        (('pos="0 0.08 0"', 'pos="nan 0.08 0"'),),
+        "<body pos='nan 0.08 0'> holds NaN: give a number",
+    ),
+    "an infinite wheel": Broken(
+        "turtlebot",
+        (('type="sphere" size="0.033"', 'type="sphere" size="inf"'),),
+        "the size of a geom is infinite: give a finite number",
+    ),
+    "a negative mass": Broken(
+        "turtlebot", (('0.02" mass="', '0.02" mass="-'),), "MuJoCo refuses it: "
+    ),
+    "grams": Broken(
+        "turtlebot",
+        (('mass="1.7"', 'mass="1700"'),),
+        "it weighs 1,700 kg: masses are in kilograms (grams are kilograms × 0.001)",
+    ),
+    "gravity that lifts": Broken(
+        "turtlebot",
+        (("<worldbody>", '<option gravity="0 0 9.81"/><worldbody>'),),
+        "its gravity is (0 0 9.81), which does not hold it on the floor",
+    ),
+    "degrees": Broken(
+        "car",
+        (('<compiler angle="radian"/>', ""),),
+        'a joint\'s range in degrees unless there is <compiler angle="radian"/>',
+    ),
+    "a wheel with an end": Broken(
+        "turtlebot",
+        (('name="left_wheel" axis="0 1 0"', 'name="left_wheel" axis="0 1 0" range="-1 1"'),),
+        "left drives left_wheel, which has a range: a wheel turns without an end",
+    ),
+    "a gear that moves nothing": Broken(
+        "turtlebot",
+        (('name="left" joint="left_wheel"', 'name="left" joint="left_wheel" gear="0"'),),
+        "left has a gear of 0, which moves nothing: leave it out",
+    ),
+    "an actuator without a name": Broken(
+        "turtlebot",
+        (('name="right" joint', "joint"),),
+        "the model has no actuator 'right': there are left, one without a name",
+    ),
+    "an actuator of no joint": Broken(
+        "turtlebot",
+        (
+            ('name="left" joint="left_wheel"', 'name="left" tendon="both"'),
+            (
+                "</mujoco>",
+                '<tendon><fixed name="both"><joint joint="left_wheel" coef="1"/></fixed></tendon>'
+                "</mujoco>",
+            ),
+        ),
+        "left drives no joint: give it joint=…",
+    ),
+    "a base that is held": Broken(
+        "turtlebot",
+        (("</mujoco>", '<equality><weld body1="base"/></equality></mujoco>'),),
+        "something holds it, such as a part that drags on the floor, a joint's damping or an",
+    ),
+    "a base that is a mocap body": Broken(
+        "turtlebot", (('name="base"', 'name="base" mocap="true"'),), "MuJoCo refuses it: "
+    ),
+    "an integrator of C alone": Broken(
+        "turtlebot",
+        (("<worldbody>", '<option integrator="implicit"/><worldbody>'),),
+        "MJX does not support mjtIntegrator.mjINT_IMPLICIT",
+    ),
+    "a file that includes itself": Broken(
+        "turtlebot",
+        (("<worldbody>", '<include file="turtlebot.xml"/><worldbody>'),),
+        "MuJoCo refuses it: XML Error: File 'turtlebot.xml' already included",
+    ),
+    "a file that includes another folder's": Broken(
+        "turtlebot",
+        (("<worldbody>", '<include file="/etc/passwd"/><worldbody>'),),
+        "/etc/passwd is outside of the model's folder",
+    ),
+    "another byte than of text": Broken(
+        "turtlebot", (("<worldbody>", "\0<worldbody>"),), "this is not XML: not well-formed"
+    ),
     "no MuJoCo model": Broken(
         "turtlebot",
         (("<mujoco", "<sdf"), ("</mujoco", "</sdf")),
@@ -211,7 +292,7 @@ BROKEN = {
     "motors that are too weak": Broken(
         "turtlebot",
         (('forcerange="-0.2 0.2"', 'forcerange="-0.0001 0.0001"'),),
-        "the motors are too weak, the wheels slip, or another part drags on the floor",
+        "the motors are too weak or too slow, the wheels slip, or something holds it",
     ),
     "a robot that falls over": Broken(
         "turtlebot",

@@ -15,7 +15,7 @@ from helpers.command_modules import train
 from helpers.small_ppo import OBS, SIZE, TINY, beginning, furthest, made_up
 from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.config import RandomizationConfig, load_config, parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.checkpoint import load_checkpoint

@@ -6,7 +6,7 @@ import numpy as np
 
 from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.runs.checkpoint import about_policy
 from jetbot_mjx.runs.checkpoint_store import CheckpointStore
 

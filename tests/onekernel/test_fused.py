@@ -12,8 +12,8 @@ import pytest
 from helpers.further import slow_unless
 from helpers.small_kernels import launches, launches_in, lowered_text
 from jetbot_mjx.config import load_config
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import EpisodeWrapper, NewEpisodeWrapper, wrap_for_training
 from jetbot_mjx.packed import pack
 from onekernel import KernelError, cpu, fuse, fused, gpu, kernel

@@ -8,7 +8,7 @@ import pytest
 from helpers import gliding
 from helpers.small_kernels import launches, made
 from jetbot_mjx.config import parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.task import GoalTask
 from jetbot_mjx.envs.wrappers import EpisodeWrapper, NewEpisodeWrapper, wrap_for_training
 from onekernel import fuse

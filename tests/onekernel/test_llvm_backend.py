@@ -18,7 +18,7 @@ from helpers import gliding
 from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import program_key
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.errors import UserError
 from onekernel import cpu, fuse, kernel

@@ -9,7 +9,7 @@ from jax.sharding import Mesh, PartitionSpec
 from helpers.run_program import evaluate
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import mjx
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.state import PhysicsState
 from onekernel.aot import xla_options
 from onekernel.errors import UnsupportedError

@@ -10,7 +10,7 @@ import pytest
 from helpers.kernel_cases import FUNCTIONS, SCANS, VECTOR, robots
 from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from onekernel import gpu
 from onekernel.kernel import Kernel
 from onekernel.lower.jaxpr import scalarize

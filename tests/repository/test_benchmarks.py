@@ -1,5 +1,6 @@
 """The benchmarks: help texts, comparison with earlier files, kernel counts, tables and plots."""
 
+import argparse
 import importlib
 import itertools
 import json
@@ -21,7 +22,7 @@ from benchmarks.harness import processes, readme_table, results, timing
 from benchmarks.harness.measurements import Sizes
 from benchmarks.harness.timing import make_row
 from benchmarks.learning import randomization
-from benchmarks.reliability import regressions
+from benchmarks.reliability import regressions, robot_fidelity
 from benchmarks.throughput import (
     adapters,
     baselines,
@@ -36,7 +37,7 @@ from benchmarks.throughput import (
     rate_plots,
 )
 from helpers.gliding import everywhere
-from jetbot_mjx.config import parse_config
+from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
 from onekernel import cpu, gpu
@@ -601,3 +602,33 @@ def test_an_ensemble_is_solved_alike_as_one_kernel_and_by_xla(tmp_path, monkeypa
     assert max(kernel["median_error"], xla["median_error"]) < 1e-3
     with pytest.raises(UserError, match=r"--tolerance 0\.0: name a number from 1e-7 to 1"):
         ensembles.main(["--tolerance", "0"])
+
+
+@pytest.mark.parametrize("friction", [None, 0.2])
+def test_robots_are_compared_with_c_mujoco_under_the_same_commands(friction, monkeypatch):
+    env = robot_fidelity.make_env(load_config("turtlebot")).blind()
+    options = argparse.Namespace(robots=4, seconds=0.5, seed=0)
+    row = robot_fidelity.measure("turtlebot", env, friction, options)
+    assert row.is_right
+    assert row.worst < 1e-2
+    assert row.driven > 10.0  # mm
+    # It does not hold by itself: MJX on ice, and C MuJoCo on the floor of the model.
+    ours, model = robot_fidelity.make_slippery(env, 0.01)
+    monkeypatch.setattr(robot_fidelity, "make_slippery", lambda *_: (ours, env.physics.mj_model))
+    assert not robot_fidelity.measure("turtlebot", env, friction, options).is_right
+    assert model.geom_friction[:, 0].max() == 0.01
+
+
+@pytest.mark.parametrize(
+    ("changed", "right"),
+    [
+        ({}, True),
+        ({"median": 0.06}, False),
+        ({"p99": 2.1}, False),
+        ({"far": ((5.0, 4.0),)}, True),
+        ({"far": ((5.0, 4.0), (5.0, 2.0))}, False),
+    ],
+)
+def test_robots_that_end_far_away_have_to_be_explained(changed, right):
+    row = robot_fidelity.Row("one", None, 0.01, 0.1, 1.0, 500.0, ())
+    assert row._replace(**changed).is_right is right

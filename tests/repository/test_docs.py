@@ -44,7 +44,7 @@ from jetbot_mjx.config import (
     load_config,
     parse_config,
 )
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs import metrics
 from jetbot_mjx.runs.sb3_tags import aliases

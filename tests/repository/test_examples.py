@@ -11,7 +11,7 @@ import jetbot_mjx
 from helpers import gliding
 from helpers.tiny import TINY
 from jetbot_mjx.config import load_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.envs.task import layout_size
 from jetbot_mjx.envs.wrappers import wrap_for_training

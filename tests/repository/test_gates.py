@@ -7,7 +7,7 @@ import pytest
 
 from helpers import gliding
 from jetbot_mjx.config import load_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.envs.wrappers import wrap_for_training
 

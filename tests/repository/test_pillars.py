@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jetbot_mjx.config import load_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
 

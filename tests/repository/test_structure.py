@@ -570,7 +570,7 @@ def test_a_forbidden_import_is_reported(name, source):
         ("cli", "import argparse"),
         ("runs.metrics", "print('line', file=stream)"),
         ("adapters.vector", "import gymnasium\nfrom jetbot_mjx.adapters.batched_env import Batch"),
-        ("adapters.vector", "from jetbot_mjx.envs.jetbot_env import make_env"),
+        ("adapters.vector", "from jetbot_mjx.envs.build import make_env"),
     ],
 )
 def test_an_allowed_import_is_not_reported(name, source):

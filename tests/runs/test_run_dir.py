@@ -4,6 +4,8 @@ import json
 import os
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -177,6 +179,23 @@ def test_a_file_is_whole_or_as_it_was_whenever_the_process_ends(tmp_path, monkey
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_writers_of_one_file_do_not_disturb_each_other(tmp_path):
+    path, texts = tmp_path / "page.html", ["a" * 300_000, "b" * 200_000]
+    write_text(path, texts[0])
+
+    def write(text):
+        for _ in range(100):
+            write_text(path, text)
+
+    with ThreadPoolExecutor(2) as pool:
+        writers = [pool.submit(write, text) for text in texts]
+        while not all(writer.done() for writer in writers):
+            assert path.read_text() in texts
+        for writer in writers:
+            writer.result()
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_half_written_files_of_a_killed_process_do_not_occupy_a_folder(tmp_path, monkeypatch):
     def die(self, target):
         raise Killed
@@ -242,7 +261,8 @@ def test_versions_are_json(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
 def test_a_pipe_in_the_place_of_an_unfinished_file_holds_nothing_up(tmp_path):
-    os.mkfifo(tmp_path / ".config.yaml.unfinished")
+    writer = f"{os.getpid()}-{threading.get_ident()}"
+    os.mkfifo(tmp_path / f".config.yaml.{writer}.unfinished")
     write_bytes(tmp_path / "config.yaml", b"seed: 1\n")
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
     os.mkfifo(tmp_path / ".policy.unfinished")

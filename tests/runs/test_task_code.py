@@ -9,7 +9,7 @@ from helpers import gliding
 import pytest
 
 from jetbot_mjx.config import load_config, parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.mujoco_env import MujocoJetBot
 from jetbot_mjx.envs.task import GoalTask
 from jetbot_mjx.errors import UserError
@@ -18,7 +18,7 @@ from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.task_code import (
     collect_task_code,
     read_task_code,
-    stored_task_class,
+    stored_class,
     write_task_code,
 )
 from jetbot_mjx.training import session
@@ -122,7 +122,7 @@ def test_packages_are_stored_with_their_folders(tmp_path, monkeypatch, capsys):
         "kicking_pkg/tasks/push.py",
     ]
     write_task_code(tmp_path, code)
-    assert stored_task_class(tmp_path, name).factor == 5
+    assert stored_class(tmp_path, name).factor == 5
     assert own_modules() == set()
 
 
@@ -155,7 +155,7 @@ def test_stored_source_runs_where_the_module_cannot_be_found(tmp_path, monkeypat
     with pytest.raises(ModuleNotFoundError):
         importlib.import_module(NAME)
     monkeypatch.chdir(tmp_path)
-    found = stored_task_class(run_dir, f"{NAME}:Task")
+    found = stored_class(run_dir, f"{NAME}:Task")
     assert issubclass(found, GoalTask)
     assert (found.__module__, found.factor) == (NAME, 3)
     said = capsys.readouterr().err
@@ -166,14 +166,14 @@ def test_stored_source_runs_where_the_module_cannot_be_found(tmp_path, monkeypat
     assert found.word(None) == "word 3"
     assert not list(run_dir.rglob("*.pyc"))
     # The same class once more, without another line.
-    assert stored_task_class(run_dir, f"{NAME}:Task") is found
+    assert stored_class(run_dir, f"{NAME}:Task") is found
     assert capsys.readouterr().err == ""
 
 
 def test_the_module_itself_runs_where_nothing_changed(tmp_path, monkeypatch, capsys):
     run_dir = store(tmp_path / "run", tmp_path / "src")
     monkeypatch.syspath_prepend(tmp_path / "src")
-    assert stored_task_class(run_dir, f"{NAME}:Task") is None
+    assert stored_class(run_dir, f"{NAME}:Task") is None
     assert capsys.readouterr().err == ""
 
 
@@ -188,7 +188,7 @@ def test_stored_source_runs_where_the_module_has_changed(tmp_path, monkeypatch, 
         (tmp_path / "src" / "kicking_words.py").unlink()
     monkeypatch.syspath_prepend(tmp_path / "src")
     on_disk = None if change == "removed" else importlib.import_module(NAME)
-    found = stored_task_class(run_dir, f"{NAME}:Task")
+    found = stored_class(run_dir, f"{NAME}:Task")
     assert found.factor == 3
     assert found.word(None) == "word 3"
     said = capsys.readouterr().err
@@ -202,7 +202,7 @@ def test_stored_source_runs_where_the_module_has_changed(tmp_path, monkeypatch, 
 def test_runs_with_different_sources_of_one_name_each_have_their_own(tmp_path):
     runs = [store(tmp_path / f"run-{n}", tmp_path / f"src-{n}", n) for n in (1, 2)]
     same = store(tmp_path / "run-3", tmp_path / "src-3", 2)
-    one, two, three = (stored_task_class(run_dir, f"{NAME}:Task") for run_dir in [*runs, same])
+    one, two, three = (stored_class(run_dir, f"{NAME}:Task") for run_dir in [*runs, same])
     assert (one.factor, two.factor) == (1, 2)
     assert (one.word(None), two.word(None)) == ("word 1", "word 2")
     assert two is three
@@ -227,24 +227,24 @@ def test_damaged_source_is_refused_in_one_line(tmp_path, file, text, said):
     else:
         (run_dir / "task" / file).write_text(text)
     with pytest.raises(UserError, match="restore it, or delete") as caught:
-        stored_task_class(run_dir, f"{NAME}:Task")
+        stored_class(run_dir, f"{NAME}:Task")
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
     assert own_modules() == set()
 
 
 def test_a_run_without_stored_source_imports_by_name(tmp_path):
-    assert stored_task_class(tmp_path, f"{NAME}:Task") is None
-    assert stored_task_class(tmp_path / "nowhere", f"{NAME}:Task") is None
+    assert stored_class(tmp_path, f"{NAME}:Task") is None
+    assert stored_class(tmp_path / "nowhere", f"{NAME}:Task") is None
     # So does one whose folder holds the source of another task.
     store(tmp_path / "run", tmp_path / "src")
-    assert stored_task_class(tmp_path / "run", "other_task:Task") is None
+    assert stored_class(tmp_path / "run", "other_task:Task") is None
 
 
 def test_this_package_is_never_replaced(tmp_path):
     code = task_code.TaskCode("jetbot_mjx", (("jetbot_mjx.py", b"raise AssertionError"),))
     write_task_code(tmp_path, code)
-    assert stored_task_class(tmp_path, "jetbot_mjx:GoalTask") is None
+    assert stored_class(tmp_path, "jetbot_mjx:GoalTask") is None
 
 
 @pytest.mark.parametrize(
@@ -258,7 +258,7 @@ def test_source_that_does_not_hold_the_task_is_refused(tmp_path, source, said):
     code = task_code.TaskCode(NAME, ((f"{NAME}.py", source.encode()),))
     write_task_code(tmp_path, code)
     with pytest.raises(UserError, match=said):
-        stored_task_class(tmp_path, f"{NAME}:Task")
+        stored_class(tmp_path, f"{NAME}:Task")
     assert own_modules() == set()
 
 
@@ -286,7 +286,7 @@ def test_dataclasses_with_annotations_as_text_work(tmp_path):
         """
     )
     write_task_code(tmp_path, task_code.TaskCode(NAME, ((f"{NAME}.py", source.encode()),)))
-    assert stored_task_class(tmp_path, f"{NAME}:Task")(3).at == 3
+    assert stored_class(tmp_path, f"{NAME}:Task")(3).at == 3
 
 
 def test_a_run_is_whole_without_the_module_and_resumes_with_its_own_task(

@@ -9,7 +9,7 @@ import pytest
 
 from jetbot_mjx.agents.networks import make_networks, make_policy
 from jetbot_mjx.config import ConfigError, parse_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import Setup, warm_start
 from jetbot_mjx.runs.checkpoint import load_checkpoint

@@ -8,7 +8,7 @@ import pytest
 
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.devices import compiler_options
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.training import memory, session

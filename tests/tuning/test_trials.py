@@ -57,7 +57,7 @@ def leaves(params):
 def test_a_trial_is_the_training_that_its_values_give(trials, outcomes):
     # The same training with the values as constants of the program.
     from jetbot_mjx.agents.ppo import PPO
-    from jetbot_mjx.envs.jetbot_env import make_env
+    from jetbot_mjx.envs.build import make_env
     from jetbot_mjx.envs.wrappers import wrap_for_training
 
     config = with_values(CONFIG, VALUES[1], source="it")

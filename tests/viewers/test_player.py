@@ -14,7 +14,7 @@ import pytest
 from helpers import gliding
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.envs.task import GoalTask
 from jetbot_mjx.errors import UserError

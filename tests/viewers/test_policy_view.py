@@ -10,8 +10,8 @@ import pytest
 from helpers import gliding
 from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks, make_policy
 from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.camera.wrapper import PIXELS
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.evaluation.occlusion import occlusion_map, overlay_heat
 from jetbot_mjx.runs.checkpoint import Checkpoint, about_policy

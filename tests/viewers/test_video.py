@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw
 
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import opengl
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import report_keys

@@ -47,6 +47,8 @@ def shape_of(
     # The kernels know one width, and one depth.
     if not isinstance(observation_size, int):
         return "it takes observations without images"
+    if network.distribution_type == "categorical":
+        return "it takes actions that are numbers, not choices"
     if hidden != network.value_hidden_layer_sizes or len(set(hidden)) > 1:
         return "it takes two networks of the same hidden layers of one width"
     sizes = observation_size, hidden[0], len(hidden), action_size

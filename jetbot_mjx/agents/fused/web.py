@@ -19,8 +19,7 @@ from jetbot_mjx.agents.fused.learner import FusedLearner, shape_of
 from jetbot_mjx.agents.fused.sample_loss import vector_of
 from jetbot_mjx.agents.fused.shapes import LossTerms, UpdateShape
 from jetbot_mjx.config import PPOConfig
-from onekernel import Kernel
-from onekernel.build import LlvmWriter, scalarize, wasm
+from onekernel.build import LlvmWriter, run_program, scalarize, wasm
 
 
 class WebLearner(NamedTuple):
@@ -87,8 +86,8 @@ def network_texts(activation: str) -> dict[str, str]:
 
     `net_product` adds the product of two matrices to a third one, `a`, `b` and `c`, whose rows are
     contiguous; it takes address and floats from row to row of each, the rows and columns (a
-    multiple of 4) of the result, and the length of the sums. `net_activate` takes the addresses of
-    some numbers and of the results, and their number.
+    multiple of 4) of the result, and the length of the sums. `net_activate` replaces numbers by
+    their activations; it takes their address, and their number, a multiple of 4.
 
     Args:
       activation: the activation between the layers.
@@ -100,12 +99,19 @@ def network_texts(activation: str) -> dict[str, str]:
     a, b, c = (Matrix(*numbers[i : i + 2]) for i in (0, 2, 4))
     multiply(a, b, c, (numbers[6], numbers[7], numbers[8]), adds=True)
     products = product_functions(wasm.LANES, wasm.REGISTERS)
+    return {"net_product": wasm.module_text([*products, w]), "net_activate": _activate(activation)}
+
+
+def _activate(activation: str) -> str:
     program = scalarize(lambda x: sample_loss.activation(activation, x)[0], vector_of())
-    kernel = Kernel(program, carried=0, steps=1, fallback=lambda x: [x])
-    return {
-        "net_product": wasm.module_text([*products, w]),
-        "net_activate": wasm.step_text("net_activate", kernel),
-    }
+    parameters = "ptr numbers", "u32 count"
+    w = LlvmWriter("net_activate", *parameters, convention="external", lanes=wasm.LANES)
+    numbers, count = w.parameters
+    with w.loop(count.to("u64") // wasm.LANES) as i:
+        place = numbers + i * wasm.LANES
+        (activated,) = run_program(w, program, [place.load(w.vector)])
+        place.store(activated)
+    return wasm.module_text([w])
 
 
 def _function(

@@ -48,6 +48,7 @@ class Simulation {
     this.hand = new Float32Array(2); // the action of whoever drives by hand
     this.byHand = false;
     this.knobs = {}; // what the visitor changed
+    this.touched = new Set(); // robots in whose episode the visitor moved the goal, pushed or drove
   }
 
   setCount(count) {
@@ -55,6 +56,7 @@ class Simulation {
     Object.assign(this.fleet.knobs, this.knobs);
     const half = Math.sqrt(count) >> 1;
     this.chosen = half * Math.ceil(Math.sqrt(count)) + half; // in the middle
+    this.touched.clear();
     this.scene.setFleet(this.fleet);
     this.setDriver(this.driver);
     this.takeWheel(this.byHand);
@@ -83,7 +85,8 @@ class Simulation {
 
   resetCounters() {
     this.fleet.resetCounters();
-    this.mine = { episodes: 0, successes: 0 };
+    this.mine = { episodes: 0, successes: 0 }; // by hand
+    this.others = { episodes: 0, successes: 0 }; // touched
   }
 
   /** Chooses a robot. Whoever drives by hand drives that one. */
@@ -98,10 +101,18 @@ class Simulation {
     this.byHand = byHand;
     this.hand.set([-1, 0]);
     this.fleet.drive(this.chosen, byHand ? this.hand : null);
+    if (byHand) this.touched.add(this.chosen);
+  }
+
+  /** Whether the task lets a visitor move a goal. */
+  get movesGoals() {
+    return this.data.meta.robot_functions.functions.includes("move");
   }
 
   setGoal(robot, x, y) {
+    if (!this.movesGoals) return;
     this.fleet.setGoal(robot, x, y);
+    this.touched.add(robot);
     this.scene.refreshGoal(robot);
   }
 
@@ -109,6 +120,7 @@ class Simulation {
   push(robot) {
     const angle = Math.random() * 2 * Math.PI, spin = Math.random() < 0.5 ? -6 : 6;
     this.fleet.push(robot, PUSH_SPEED * Math.cos(angle), PUSH_SPEED * Math.sin(angle), spin);
+    this.touched.add(robot);
   }
 
   /** Makes the steps that belong to some seconds of real time, but for those that take too long. */
@@ -129,11 +141,16 @@ class Simulation {
   }
 
   step() {
-    const { fleet, chosen, mine } = this;
+    const { fleet, touched, mine, others } = this;
     fleet.step();
-    if (this.byHand && fleet.done[chosen]) {
-      mine.episodes++;
-      mine.successes += fleet.success[chosen];
+    for (const robot of touched) {
+      if (!fleet.done[robot]) continue;
+      const driven = this.byHand && robot === this.chosen;
+      for (const counter of driven ? [others, mine] : [others]) {
+        counter.episodes++;
+        counter.successes += fleet.success[robot];
+      }
+      if (!driven) touched.delete(robot);
     }
     this.scene.record();
   }
@@ -143,10 +160,10 @@ class Simulation {
     return Math.min(1, this.backlog / this.data.meta.dt);
   }
 
-  /** Goals reached by others than the visitor, and their episodes. */
+  /** Goals reached without the visitor, and the episodes of these robots. */
   get score() {
-    const { fleet, mine } = this;
-    return { successes: fleet.successes - mine.successes, episodes: fleet.episodes - mine.episodes };
+    const { fleet, others } = this;
+    return { successes: fleet.successes - others.successes, episodes: fleet.episodes - others.episodes };
   }
 }
 
@@ -175,7 +192,7 @@ class Gestures {
     const hit = scene.pick(x, y, event.pointerType === "touch" ? 30 : 16);
     this.moved = 0;
     this.hit = hit;
-    if (hit?.goal && event.button === 0) {
+    if (hit?.goal && event.button === 0 && this.simulation.movesGoals) {
       this.mode = "goal";
       this.choose(hit.robot);
     } else this.mode = event.button === 0 && !event.shiftKey ? "orbit" : "pan";
@@ -238,7 +255,7 @@ class Gestures {
   /** Shows by the cursor what a press would do. */
   #look(hit = this.hit) {
     const drags = this.mode === "goal" || this.mode === "pan";
-    const name = drags ? "drag" : hit ? (hit.goal ? "grab" : "point") : "";
+    const name = drags ? "drag" : hit ? (hit.goal && this.simulation.movesGoals ? "grab" : "point") : "";
     if (this.canvas.className !== name) this.canvas.className = name;
   }
 }
@@ -362,7 +379,7 @@ class RobotPanel {
       const numbers = Array.from(observation.subarray(start, start + size), (x) => RobotPanel.#signed(x, 2));
       write(value, numbers.join(", "));
     }
-    const { max_speed: speed, max_yaw_rate: yaw } = this.meta;
+    const { max_yaw_rate: yaw } = this.meta, speed = this.meta.max_speed === null ? null : fleet.knobs.maxSpeed;
     const units = [`${((Math.max(-1, action[0]) + 1) / 2 * speed).toFixed(2)} m/s`, yaw === null ? "" : `${RobotPanel.#signed(action[1] * yaw, 2)} rad/s`];
     const shown = speed === null ? Array.from(action, (x) => RobotPanel.#signed(x, 2)) : units;
     for (const [i, { fill, output }] of this.meters.entries()) {
@@ -374,7 +391,8 @@ class RobotPanel {
   }
 
   static #signed(x, digits) {
-    return `${x < 0 ? "−" : "+"}${Math.abs(x).toFixed(digits)}`;
+    const text = Math.abs(x).toFixed(digits);
+    return `${x < 0 && Number(text) > 0 ? "−" : "+"}${text}`;
   }
 
   #drawImage(image) {
@@ -602,6 +620,7 @@ class App {
     // A drive that is a function of its own has no speed and no yaw rate that others could command.
     if (this.meta.max_speed !== null) drivers.push(["scripted", "Scripted", "no network"]);
     byId("manual").hidden = this.meta.max_speed === null;
+    byId("move-goals").hidden = !this.simulation.movesGoals;
     drivers.push(["learning", "Learning", "in this page"]);
     this.#choices(byId("drivers"), "driver", drivers, `policy ${policies.length - 1}`, (name) => this.setDriver(name));
     this.learning = document.querySelector("input[value=learning]");

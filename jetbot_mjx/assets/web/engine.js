@@ -144,8 +144,8 @@ class Network {
   constructor(memory, policy, count) {
     this.memory = memory;
     this.count = count;
-    this.layers = policy.layers.map((layer) => this.#room(layer, count));
-    this.encoder = policy.encoder ? this.#encoder(policy.encoder) : null;
+    this.encoder = policy.encoder ? new Encoder(memory, policy.encoder, count) : null;
+    this.layers = policy.layers.map(({ kernel, bias }) => new Layer(memory, kernel.length / bias.length, bias.length, count));
     this.inputs = this.layers[0].inputs;
     this.input = memory.array(count * this.inputs);
     this.load(policy);
@@ -156,71 +156,8 @@ class Network {
     this.mean = policy.mean;
     this.scale = Float32Array.from(policy.std, (x) => 1 / x);
     this.squash = policy.squash;
-    const rooms = [...this.layers], layers = [...policy.layers];
-    if (this.encoder) {
-      rooms.push(...this.encoder.steps.map((step) => step.layer), this.encoder.dense);
-      layers.push(...policy.encoder.convolutions, policy.encoder.dense);
-    }
-    for (const [i, { weights, biases, inputs, outputs, columns }] of rooms.entries()) {
-      const { kernel, bias } = layers[i];
-      for (let row = 0; row < inputs; row++)
-        weights.view.set(kernel.subarray(row * outputs, (row + 1) * outputs), row * columns);
-      biases.set(bias);
-    }
-  }
-
-  /** Takes memory for a layer, with columns of zeros up to a multiple of 4, and for its results. */
-  #room({ kernel, bias }, rows) {
-    const outputs = bias.length, columns = Math.ceil(outputs / 4) * 4, inputs = kernel.length / outputs;
-    const weights = this.memory.array(inputs * columns), biases = new Float32Array(columns);
-    return { weights, biases, inputs, outputs, columns, results: this.memory.array(rows * columns) };
-  }
-
-  /** Prepares convolutions as products: each of their outputs is a row of the pixels around it. */
-  #encoder({ shape, convolutions, dense }) {
-    let [height, width, channels] = shape;
-    const steps = convolutions.map(({ kernel, bias, side, stride }) => {
-      const from = { height, width, channels };
-      height = Math.floor((height - side) / stride) + 1;
-      width = Math.floor((width - side) / stride) + 1;
-      channels = bias.length;
-      const layer = this.#room({ kernel, bias }, height * width);
-      return { from, side, stride, height, width, layer, patches: this.memory.array(height * width * layer.inputs) };
-    });
-    return { steps, dense: this.#room(dense, 1), flat: this.memory.array(height * width * channels) };
-  }
-
-  /** Computes some rows of a layer from the numbers at an address, of which `stride` belong to a row. */
-  #apply(layer, address, stride, rows) {
-    const { weights, biases, inputs, columns, results } = layer, view = results.view;
-    for (let row = 0; row < rows; row++) view.set(biases, row * columns);
-    this.memory.functions.net_product(
-      address, stride, weights.address, columns, results.address, columns, rows, columns, inputs,
-    );
-  }
-
-  /** Returns the features of an image of bytes, and ends with ReLU. */
-  #features(pixels, start) {
-    let source = pixels, offset = start, stride = null;
-    for (const { from, side, stride: step, height, width, layer, patches } of this.encoder.steps) {
-      const pixel = stride ?? from.channels, view = patches.view;
-      let to = 0;
-      for (let y = 0; y < height; y++)
-        for (let x = 0; x < width; x++)
-          for (let row = 0; row < side; row++)
-            for (let column = 0; column < side; column++) {
-              const at = offset + ((y * step + row) * from.width + x * step + column) * pixel;
-              for (let channel = 0; channel < from.channels; channel++) view[to++] = source[at + channel];
-            }
-      this.#apply(layer, patches.address, layer.inputs, height * width);
-      source = rectified(layer.results.view);
-      [offset, stride] = [0, layer.columns];
-    }
-    const { flat, dense, steps } = this.encoder, last = steps[steps.length - 1].layer, view = flat.view;
-    for (let i = 0; i < view.length; i++)
-      view[i] = source[Math.floor(i / last.outputs) * last.columns + (i % last.outputs)];
-    this.#apply(dense, flat.address, dense.inputs, 1);
-    return rectified(dense.results.view).subarray(0, dense.outputs);
+    for (const [i, layer] of this.layers.entries()) layer.load(policy.layers[i]);
+    this.encoder?.load(policy.encoder);
   }
 
   /**
@@ -231,21 +168,18 @@ class Network {
    * @param {number} size numbers of an action
    */
   act(observed, images, actions, size) {
-    const input = this.input.view, { count, inputs, mean, scale } = this;
-    const seen = inputs - mean.length;
+    const { count, inputs, mean, scale } = this, seen = inputs - mean.length, input = this.input.view;
+    if (this.encoder) this.encoder.look(images, input, inputs);
     for (let robot = 0; robot < count; robot++) {
-      const start = robot * inputs;
-      if (this.encoder) input.set(this.#features(images.bytes, robot * images.size), start);
-      const numbers = observed(robot);
-      for (let i = 0; i < mean.length; i++) input[start + seen + i] = (numbers[i] - mean[i]) * scale[i];
+      const start = robot * inputs + seen, numbers = observed(robot);
+      for (let i = 0; i < mean.length; i++) input[start + i] = (numbers[i] - mean[i]) * scale[i];
     }
     // The hidden layers with their activation, and the last one.
     let address = this.input.address, stride = inputs;
     for (const [i, layer] of this.layers.entries()) {
-      this.#apply(layer, address, stride, count);
       const { results } = layer;
-      if (i < this.layers.length - 1)
-        this.memory.functions.net_activate(results.address, results.address, results.length);
+      layer.apply(address, stride);
+      if (i < this.layers.length - 1) this.memory.functions.net_activate(results.address, results.length);
       [address, stride] = [results.address, layer.columns];
     }
     const last = this.layers[this.layers.length - 1], outputs = last.results.view;
@@ -257,10 +191,123 @@ class Network {
   }
 }
 
-/** Sets negative numbers to zero, and returns the same array. */
-function rectified(numbers) {
+/** A layer with columns of zeros up to a multiple of 4, and its results for some rows. */
+class Layer {
+  /**
+   * @param {Memory} memory the memory
+   * @param {number} inputs the inputs of its kernel
+   * @param {number} outputs the outputs
+   * @param {number} rows the most rows to which it is applied at once
+   * @param {{used: number, room: number, places: number, stride: number}} layout inputs that come in groups of `room`
+   *   numbers, of which the first `used` count, and results for `places` places of a row, which are `stride` apart
+   */
+  constructor(memory, inputs, outputs, rows, { used = 1, room = 1, places = 1, stride = null } = {}) {
+    const columns = Math.ceil(outputs / 4) * 4, groups = inputs / used;
+    Object.assign(this, { memory, inputs, outputs, columns, rows, used, room, places });
+    this.stride = stride ?? places * columns;
+    this.weights = memory.array(groups * room * columns);
+    this.results = memory.array(rows * this.stride);
+    this.biases = new Float32Array(this.results.length);
+  }
+
+  load({ kernel, bias }) {
+    const { inputs, outputs, columns, used, room, rows, places, stride, biases } = this, weights = this.weights.view;
+    for (let input = 0; input < inputs; input++) {
+      const row = Math.floor(input / used) * room + (input % used);
+      weights.set(kernel.subarray(input * outputs, (input + 1) * outputs), row * columns);
+    }
+    for (let row = 0; row < rows; row++)
+      for (let place = 0; place < places; place++) biases.set(bias, row * stride + place * columns);
+  }
+
+  /** Sets the results to the biases. */
+  begin() {
+    this.results.view.set(this.biases);
+  }
+
+  /** Adds the products of rows of `length` numbers, `stride` apart, with the weights from `first` on. */
+  add(address, stride, first, length, place = 0) {
+    const { memory, weights, columns, results, rows } = this;
+    memory.functions.net_product(
+      address, stride, weights.address + 4 * first * columns, columns,
+      results.address + 4 * place * columns, this.stride, rows, columns, length,
+    );
+  }
+
+  /** Computes the results from rows of numbers, `stride` apart. */
+  apply(address, stride) {
+    this.begin();
+    this.add(address, stride, 0, (this.inputs / this.used) * this.room);
+  }
+}
+
+const TOGETHER = 32; // robots whose images are encoded at once, so that the numbers stay in the processor's cache
+const APART = 16; // numbers between the images of two robots: powers of two meet in the same place of a cache
+
+/** The convolutions of a policy and the dense layer behind them, of some robots at a time. */
+class Encoder {
+  constructor(memory, { shape, convolutions, dense }, count) {
+    let [height, width, channels] = shape, room = channels;
+    const rows = Math.min(count, TOGETHER), apart = height * width * channels + APART;
+    Object.assign(this, { memory, count, rows, size: height * width * channels, apart });
+    this.pixels = memory.array(rows * apart);
+    this.steps = convolutions.map(({ bias, side, stride }) => {
+      const from = { width, room }, inputs = side * side * channels, used = channels;
+      height = Math.floor((height - side) / stride) + 1;
+      width = Math.floor((width - side) / stride) + 1;
+      channels = bias.length;
+      const places = height * width, columns = Math.ceil(channels / 4) * 4;
+      const layer = new Layer(memory, inputs, channels, rows, { used, room, places, stride: places * columns + APART });
+      room = columns;
+      return { from, side, stride, height, width, layer };
+    });
+    const inputs = height * width * channels;
+    this.dense = new Layer(memory, inputs, dense.bias.length, rows, { used: channels, room });
+  }
+
+  load({ convolutions, dense }) {
+    for (const [i, { layer }] of this.steps.entries()) layer.load(convolutions[i]);
+    this.dense.load(dense);
+  }
+
+  /** Writes the features of all robots' images into rows of `inputs` numbers. */
+  look({ bytes, size }, input, inputs) {
+    const { count, rows, apart, dense } = this, { outputs, columns } = dense;
+    for (let first = 0; first < count; first += rows) {
+      // The last robots may be fewer; those before them come again.
+      const start = Math.min(first, count - rows), pixels = this.pixels.view;
+      for (let row = 0; row < rows; row++)
+        pixels.set(bytes.subarray((start + row) * size, (start + row + 1) * size), row * apart);
+      this.#encode();
+      const features = dense.results.view;
+      for (let row = 0; row < rows; row++)
+        input.set(features.subarray(row * columns, row * columns + outputs), (start + row) * inputs);
+    }
+  }
+
+  /** Takes images through all layers, each of which ends with ReLU. */
+  #encode() {
+    let { address } = this.pixels, robot = this.apart;
+    for (const { from, side, stride, height, width, layer } of this.steps) {
+      // The inputs of a place are rows of pixels, whose numbers are next to each other.
+      const length = side * from.room;
+      layer.begin();
+      for (let place = 0; place < height * width; place++)
+        for (let row = 0; row < side; row++) {
+          const y = Math.floor(place / width) * stride + row, x = (place % width) * stride;
+          layer.add(address + 4 * (y * from.width + x) * from.room, robot, row * length, length, place);
+        }
+      rectify(layer.results.view);
+      [address, robot] = [layer.results.address, layer.stride];
+    }
+    this.dense.apply(address, robot);
+    rectify(this.dense.results.view);
+  }
+}
+
+/** Sets negative numbers to zero. */
+function rectify(numbers) {
   for (let i = 0; i < numbers.length; i++) if (numbers[i] < 0) numbers[i] = 0;
-  return numbers;
 }
 
 /** Returns the arrays of a policy as `Network` takes them. */
@@ -357,7 +404,7 @@ class Fleet {
     this.robots.reset(this.keys);
     this.done.fill(1);
     this.time = 0;
-    if (this.eyes) this.eyes.look(this.done);
+    if (this.eyes && this.policy) this.eyes.look(this.done);
     this.done.fill(0);
   }
 
@@ -366,8 +413,11 @@ class Fleet {
     // All policies of a page have layers of the same sizes.
     if (policy && this.network) this.network.load(policy);
     else if (policy) this.network = new Network(this.memory, policy, this.count);
+    const sees = this.eyes && policy && !this.policy;
     this.policy = policy && this.network;
     this.scripted = false;
+    // While others drove, nobody looked.
+    if (sees) this.eyes.look(new Uint8Array(this.count).fill(1));
   }
 
   /** Makes one step of all robots, `meta.dt` seconds. */
@@ -384,7 +434,7 @@ class Fleet {
       this.successes += success[robot];
     }
     this.time += this.meta.dt;
-    if (this.eyes) this.eyes.look(done);
+    if (this.eyes && this.policy) this.eyes.look(done);
   }
 
   /** Position (x, y, z) [m] and quaternion (w, x, y, z) of each body of each robot, in the world's frame. */
@@ -494,31 +544,30 @@ class Eyes {
     this.rendered = memory.array(Math.ceil((count * height * width * channels) / 4), Uint32Array);
   }
 
-  /** Renders the images of all robots; those that begin an episode have copies of the first one. */
-  look(begins) {
-    const { robots, count, meta } = this.fleet, { channels, frames } = meta.image, stacked = channels * frames;
-    robots.call("frame", robots.words.address, this.shared.address, count);
-    robots.call("image", this.shared.address, this.table.address, this.rendered.address, count);
-    const { bytes, size } = this, pixels = size / stacked;
-    const images = new Uint8Array(this.rendered.memory.buffer, this.rendered.address, count * pixels * channels);
-    for (let robot = 0; robot < count; robot++)
-      for (let pixel = 0; pixel < pixels; pixel++) {
-        const to = robot * size + pixel * stacked, from = (robot * pixels + pixel) * channels;
-        if (!begins[robot]) bytes.copyWithin(to, to + channels, to + stacked);
-        const first = begins[robot] ? 0 : frames - 1;
-        for (let frame = first; frame < frames; frame++)
-          for (let channel = 0; channel < channels; channel++)
-            bytes[to + frame * channels + channel] = images[from + channel];
-      }
+  /** Renders the images of some robots, from the first one on, and returns their bytes. */
+  #render(first, count) {
+    const { robots, meta } = this.fleet, { shared, table, rendered } = this, { height, width, channels } = meta.image;
+    robots.call("frame", robots.words.address + 4 * first * robots.about.words, shared.address, count);
+    robots.call("image", shared.address, table.address, rendered.address, count);
+    return new Uint8Array(rendered.memory.buffer, rendered.address, count * height * width * channels);
   }
 
-  /** Returns a robot's newest image. */
+  /** Renders the images of all robots; those that begin an episode have copies of the first one. */
+  look(begins) {
+    const { count, meta } = this.fleet, { channels, frames } = meta.image, stacked = channels * frames;
+    const { bytes, size } = this, images = this.#render(0, count);
+    if (frames === 1) return void bytes.set(images);
+    for (let robot = 0, from = 0; robot < count; robot++) {
+      const first = begins[robot] ? 0 : stacked - channels, end = (robot + 1) * size;
+      for (let to = robot * size; to < end; to += stacked, from += channels) {
+        for (let i = 0; i < first; i++) bytes[to + i] = bytes[to + i + channels];
+        for (let i = first; i < stacked; i++) bytes[to + i] = images[from + (i % channels)];
+      }
+    }
+  }
+
+  /** Renders a robot's image, whose bytes stay until the next one is rendered. */
   newest(robot) {
-    const { channels, frames } = this.fleet.meta.image, stacked = channels * frames, { bytes, size } = this;
-    const image = new Uint8Array(size / frames);
-    for (let pixel = 0; pixel < size / stacked; pixel++)
-      for (let channel = 0; channel < channels; channel++)
-        image[pixel * channels + channel] = bytes[robot * size + (pixel + 1) * stacked - channels + channel];
-    return image;
+    return this.#render(robot, 1);
   }
 }

@@ -320,7 +320,7 @@ function wilson(successes, count) {
   const z = 1.96, share = successes / count, spread = z * z / count;
   const middle = (share + spread / 2) / (1 + spread);
   const half = z * Math.sqrt((share * (1 - share)) / count + spread / (4 * count)) / (1 + spread);
-  return [middle - half, middle + half];
+  return [Math.max(0, middle - half), Math.min(1, middle + half)];
 }
 
 if (typeof document === "undefined" && typeof self !== "undefined") {

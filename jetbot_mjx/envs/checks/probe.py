@@ -63,12 +63,26 @@ def describe_error(error: Exception, who: str, folders: Sequence[Path]) -> str:
     places = [
         (file, line)
         for file, line in places
-        if (file.parent in folders if folders else file.parent != _PACKAGE)
+        if (file.parent in folders if folders else _PACKAGE not in file.parents)
         and "site-packages" not in file.parts
         and not str(file).startswith("<")
     ]
     where = f" ({places[-1][0].name}:{places[-1][1]})" if places else ""
     return " ".join(f"{who} raises {kind}{': ' * bool(what)}{what}{where}".split())
+
+
+def changed_leaf(first: object, last: object) -> str:
+    """Return the first leaf whose shape or dtype differs between two states; empty if none."""
+    sides = [dict(jax.tree_util.tree_leaves_with_path(state)) for state in (first, last)]
+    for path in (*sides[0], *sides[1]):
+        one, other = (_type(side.get(path)) for side in sides)
+        if one != other:
+            return jax.tree_util.keystr(path).lstrip(".")
+    return ""
+
+
+def _type(leaf: jax.ShapeDtypeStruct | None) -> object:
+    return None if leaf is None else (leaf.shape, leaf.dtype, leaf.weak_type)
 
 
 # Inputs and results of the methods.

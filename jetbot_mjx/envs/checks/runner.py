@@ -19,10 +19,11 @@ from jetbot_mjx.envs.checks.probe import (
     DRAWS,
     TaskProbe,
     call_methods,
+    changed_leaf,
     describe_error,
     first_key,
 )
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.jetbot_env import make_jetbot_env
 from jetbot_mjx.envs.mjcf_robot import PREFIX
 from jetbot_mjx.envs.robot_model import make_mj_model, mocap_ids
 from jetbot_mjx.envs.state import State
@@ -175,10 +176,10 @@ def _touching(probe: TaskProbe, solid: mujoco.MjModel) -> Iterator[str]:
 def _drive(probe: TaskProbe) -> Iterator[str]:
     """Step the environment of a training with random and extreme actions."""
     # Compare the trees of the states before and after a step.
-    env = make_env(probe.config)
+    env = make_jetbot_env(probe.config)
     first = jax.eval_shape(env.reset, first_key())
     second = jax.eval_shape(env.step, first, jax.eval_shape(lambda: jnp.zeros(env.action_size)))
-    if unlike := _changed(first, second):
+    if unlike := changed_leaf(first, second):
         yield f"a step changes the state's {unlike}: keep names, tree, shapes and dtypes"
         return
     # Count how often a step is traced.
@@ -206,20 +207,6 @@ def _drive(probe: TaskProbe) -> Iterator[str]:
             f"{nonfinite} of {DRIVE_STEPS * DRIVE_ENVS} steps are not finite: look at observe and"
             " reward, and at what the robot runs into"
         )
-
-
-def _changed(first: object, last: object) -> str:
-    """Return the first leaf whose shape or dtype differs between two states; empty if none."""
-    sides = [dict(jax.tree_util.tree_leaves_with_path(state)) for state in (first, last)]
-    for path in (*sides[0], *sides[1]):
-        one, other = (_type(side.get(path)) for side in sides)
-        if one != other:
-            return jax.tree_util.keystr(path).lstrip(".")
-    return ""
-
-
-def _type(leaf: jax.ShapeDtypeStruct | None) -> object:
-    return None if leaf is None else (leaf.shape, leaf.dtype, leaf.weak_type)
 
 
 CHECKS: Mapping[str, tuple[Callable[[TaskProbe], Iterator[str]], str]] = {

@@ -10,10 +10,10 @@ import pytest
 from helpers import gliding
 from helpers.command_modules import train
 from jetbot_mjx.config import ConfigError, LookParams, load_config, parse_config
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.camera.looks import Appearance
 from jetbot_mjx.envs.camera.wrapper import PIXELS, with_camera
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import report_keys

@@ -6,9 +6,9 @@ import pytest
 
 from helpers.camera_scenes import ROBOT, make_model
 from jetbot_mjx.config import CameraConfig, ConfigError, parse_config
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.camera.lens import Footprint, Rays, intrinsics, pixel_grid
 from jetbot_mjx.envs.camera.render import Camera
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import InvalidError
 
 JETBOT = {"width": 224, "height": 224, "matrix": (114.0, 113.0, 113.5, 110.0)}

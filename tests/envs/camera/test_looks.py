@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from jetbot_mjx.config import CameraConfig, Config, LookParams
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.camera.looks import PLAIN, Appearance, add_noise
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.scene import GOAL
 from jetbot_mjx.envs.camera.surroundings import draw_surroundings
-from jetbot_mjx.envs.jetbot_env import make_env
 
 SIDE = 48
 FOCAL = SIDE / 2  # [pixels] of 90 degrees

@@ -10,11 +10,11 @@ import pytest
 
 from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks
 from jetbot_mjx.config import CameraConfig, load_config
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.camera import mujoco_camera
 from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.scenery import SCENERIES, draw_scenery
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
@@ -156,7 +156,7 @@ ONE_PICTURE = """
 import numpy as np
 from jetbot_mjx.config import CameraConfig, load_config
 from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.build import make_env
 
 env = make_env(load_config("configs/jetbot_camera.yaml"))
 camera = MujocoCamera(CameraConfig(width=16, height=16), env.mj_model)

@@ -13,8 +13,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from helpers.camera_scenes import Scenes, make_model, turned
 from jetbot_mjx.config import CameraConfig, Config
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.camera.render import Camera
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.opengl import find_backend
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError

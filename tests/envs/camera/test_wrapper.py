@@ -8,9 +8,9 @@ import pytest
 
 from helpers import gliding
 from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.envs.task import Field, GoalTask
 from jetbot_mjx.envs.wrappers import wrap_for_training

@@ -1,4 +1,4 @@
-"""Chromium without a window, driven by its DevTools protocol."""
+"""Drive Chromium without a window, by its DevTools protocol."""
 
 import base64
 import contextlib
@@ -9,15 +9,15 @@ import subprocess
 import tempfile
 import time
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-import pytest
+from jetbot_mjx.errors import UserError
 
-NAMES = ("chromium", "chromium-browser", "google-chrome")
+_NAMES = ("chromium", "chromium-browser", "google-chrome")
 
-PROGRAM = next(filter(None, map(shutil.which, NAMES)), None)
-
-OPTIONS = (
+_OPTIONS = (
     "--headless",
     "--no-sandbox",
     "--hide-scrollbars",
@@ -27,26 +27,38 @@ OPTIONS = (
 )
 
 
-class Tab:
-    """A tab of the browser. `errors` are what the page's console told as errors."""
+def find_browser() -> str | None:
+    """Return Chromium's program, or None."""
+    return next(filter(None, map(shutil.which, _NAMES)), None)
 
-    def __init__(self, socket):
+
+class Tab:
+    """A tab of the browser."""
+
+    def __init__(self, socket: Any) -> None:
+        """Listen to a tab.
+
+        Args:
+          socket: a connection to the tab's debugger.
+        """
         self._socket, self._numbers = socket, itertools.count(1)
-        self.errors = []
+        self.errors: list[Any] = []
+        """What the page's console reported as errors."""
         for domain in ("Runtime", "Log", "Page"):
             self.send(f"{domain}.enable")
 
-    def send(self, method, **params):
+    def send(self, method: str, **params: Any) -> dict[str, Any]:
+        """Call a method of the protocol and return its result."""
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
         while True:
-            told = json.loads(self._socket.recv(timeout=60))
+            told = json.loads(self._socket.recv(timeout=120))
             if told.get("id") == number:
                 assert "error" not in told, told
                 return told["result"]
             self._listen(told)
 
-    def _listen(self, told):
+    def _listen(self, told: dict[str, Any]) -> None:
         given = told.get("params", {})
         match told["method"]:
             case "Runtime.exceptionThrown":
@@ -56,7 +68,14 @@ class Tab:
             case "Log.entryAdded" if given["entry"]["level"] == "error":
                 self.errors.append(given["entry"])
 
-    def open(self, page, width, height):
+    def open(self, page: Path | str, width: int, height: int) -> None:
+        """Open a page, in a window of `width` × `height` pixels.
+
+        Args:
+          page: a file or an address.
+          width: a width below 600 pixels is a telephone's.
+          height: the height.
+        """
         self.send(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -66,33 +85,42 @@ class Tab:
         )
         self.send("Page.navigate", url=page if isinstance(page, str) else page.as_uri())
 
-    def run(self, script):
-        """The value of an expression of JavaScript, which may be a promise."""
+    def run(self, script: str) -> Any:
+        """Return the value of an expression of JavaScript, which may be a promise."""
         given = {"expression": script, "awaitPromise": True, "returnByValue": True}
         result = self.send("Runtime.evaluate", **given)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
-    def wait_for(self, script, seconds=60):
+    def wait_for(self, script: str, seconds: float = 60) -> None:
         """Wait until an expression is true."""
         end = time.monotonic() + seconds
         while not self.run(script):
             assert time.monotonic() < end, (script, self.errors)
             time.sleep(0.1)
 
-    def picture(self):
-        """The page as PNG."""
+    def picture(self) -> bytes:
+        """Return the page as PNG."""
         return base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
 
 
 @contextlib.contextmanager
-def tab():
-    """A tab of a new browser; without one, the test is skipped."""
-    if PROGRAM is None:
-        pytest.skip("there is no Chromium")
-    client = pytest.importorskip("websockets.sync.client")
-    with tempfile.TemporaryDirectory() as folder:
-        command = [PROGRAM, *OPTIONS, f"--user-data-dir={folder}", "about:blank"]
+def open_tab() -> Iterator[Tab]:
+    """Yield a tab of a new browser.
+
+    Raises:
+      UserError: Chromium or `websockets` is not installed.
+    """
+    program = find_browser()
+    if program is None:
+        raise UserError("Chromium is not installed: apt install chromium")
+    try:
+        from websockets.sync.client import connect
+    except ModuleNotFoundError:
+        raise UserError("websockets is not installed: pip install websockets") from None
+
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        command = [program, *_OPTIONS, f"--user-data-dir={folder}", "about:blank"]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             port = _port(Path(folder, "DevToolsActivePort"))
@@ -100,14 +128,14 @@ def tab():
             (address,) = [
                 one["webSocketDebuggerUrl"] for one in json.load(listed) if one["type"] == "page"
             ]
-            with client.connect(address, max_size=None) as socket:
+            with connect(address, max_size=None) as socket:
                 yield Tab(socket)
         finally:
             process.kill()
             process.wait()
 
 
-def _port(file):
+def _port(file: Path) -> int:
     end = time.monotonic() + 60
     while not (file.is_file() and file.read_text().count("\n")):
         assert time.monotonic() < end, "Chromium did not start"

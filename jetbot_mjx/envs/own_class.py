@@ -1,0 +1,60 @@
+"""Import the class of a task or an environment of one's own."""
+
+import difflib
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+from jetbot_mjx.config import find_task_here
+from jetbot_mjx.errors import InvalidError, MissingPackageError
+
+
+def import_class(key: str, name: str) -> Any:
+    """Import what a name `package.module:Class` refers to, which may not be a class.
+
+    Args:
+      key: the setting that names it.
+      name: the name.
+
+    Raises:
+      UserError: the name is malformed, or cannot be imported.
+    """
+    module_name, separator, class_name = name.partition(":")
+    if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:
+        # Python itself separates a class from its module by a dot.
+        likely = ":".join(module_name.rpartition(".")[::2])
+        hint = f", perhaps {likely}" if not separator and likely[0] not in ".:" else ""
+        raise InvalidError(f"{key} = {name!r} is wrong: write package.module:Class{hint}")
+    if module_name.endswith(".py"):
+        likely = f"{module_name.removesuffix('.py').replace(os.sep, '.')}:{class_name}"
+        raise InvalidError(f"{key} = {name!r} names a file: write the module, {likely}")
+    find_task_here(module_name)
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if f"{module_name}.".startswith(f"{error.name}."):
+            here = sorted(path.stem for path in Path().glob("*.py"))
+            close = difflib.get_close_matches(module_name, here, n=1)
+            hint = f": did you mean {close[0]}:{class_name}?" if close else ""
+            raise MissingPackageError(
+                f"{key} = {name!r}: there is no {module_name.replace('.', os.sep)}.py beside"
+                f" the YAML file or in the current folder, and no such package{hint}"
+            ) from None
+        raise MissingPackageError(
+            f"{key} = {name!r}: {module_name} imports {error.name!r}, which is not installed:"
+            " install it"
+        ) from None
+    except SyntaxError as error:
+        raise InvalidError(
+            f"{key} = {name!r}: {error.filename}, line {error.lineno}, is not valid Python:"
+            f" {error.msg}"
+        ) from None
+    found, owner = module, module_name
+    for part in class_name.split("."):
+        if not hasattr(found, part):
+            close = difflib.get_close_matches(part, dir(found), n=1)
+            hint = f": did you mean {close[0]!r}?" if close else ""
+            raise InvalidError(f"{key} = {name!r}: {owner} has no {part!r}{hint}")
+        found, owner = getattr(found, part), part
+    return found
