@@ -22,7 +22,6 @@ from onekernel.kernel import Kernel
 from onekernel.lower import (
     Block,
     Expr,
-    LateProgram,
     PlacedLoop,
     Scalar,
     ScalarProgram,
@@ -148,15 +147,16 @@ class _Hasher:
         self._word(str(atom.aval))
 
     def _kernel(self, kernel: Kernel) -> None:
+        if kernel.identity is not None:
+            self._word("kernel", kernel.identity, kernel.steps)
+            return
         self._word("kernel", kernel.carried, kernel.steps, kernel.impl)
         self.add(kernel.table)
         self.add([str(x) for x in kernel.argument_dtypes or ()])
         self.add([str(x) for x in kernel.result_dtypes or ()])
         for program in (kernel.before, kernel.program, kernel.after):
             self._word(program is None)
-            if isinstance(program, LateProgram):
-                self._word(program.identity)
-            elif program is not None:
+            if program is not None:
                 self._program(program)
 
     def _program(self, program: ScalarProgram) -> None:

@@ -43,7 +43,7 @@ from onekernel.backends import default_backend
 from onekernel.check import check
 from onekernel.errors import KernelError, UnsupportedError
 from onekernel.kernel import Kernel, called_by, is_debugging, varying_axes
-from onekernel.lower import MAX_ARRAY_BYTES, LateProgram, scalarize_part
+from onekernel.lower import MAX_ARRAY_BYTES, scalarize_part
 
 CHECK = "ONEKERNEL_CHECK"
 """Environment variable: with `1`, kernels are checked before their first use."""
@@ -383,14 +383,13 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
         raise UnsupportedError("a kernel for several instances")
     if step.unsupported:
         raise step.unsupported
-    program = step.program.lowered if isinstance(step.program, LateProgram) else step.program
     # The part in front computes the arguments of the call; the part behind computes the results
     # from the arguments of the function and the results of the call. `scalarize_part` lowers only
     # what its results need, so the cut needs no list of equations.
     before = lower(arguments, calls[0].invars)
     after = lower([*arguments, *calls[0].outvars], results)
     return Kernel(
-        program,
+        step.program,
         carried=step.carried,
         steps=step.steps,
         fallback=_fallback(traced, places),

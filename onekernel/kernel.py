@@ -100,6 +100,8 @@ class Kernel:
     all are float32."""
     result_dtypes: Sequence[np.dtype] | None = None
     """Those of the results, likewise; with a table there are none."""
+    identity: str | None = None
+    """What the kernel is made from, by which it is known in other processes; None: its programs."""
     _texts: dict[str, str] = dataclasses.field(default_factory=dict, init=False)
     """Texts that back ends have written of the kernel, by a name of their choice."""
     # Programs are lowered in several threads, and each text is written once.
@@ -119,10 +121,11 @@ class Kernel:
 
     @functools.cached_property
     def unsupported(self) -> UnsupportedError | None:
-        """Return why a kernel whose program is lowered late cannot be one; None: it can."""
+        """Lower a late program, and return why the kernel cannot be one; None: it can."""
         try:
             if isinstance(self.program, LateProgram):
-                require(self.program.lowered)
+                self.program = self.program.lowered
+                require(self.program)
         except UnsupportedError as error:
             return error
         return None

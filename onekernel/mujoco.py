@@ -285,8 +285,8 @@ class FusedMjx:
             lambda: scalarize(self._substep, *arguments),
             [x.shape for x in leaves],
             [x.shape for x in jax.tree.leaves(arguments[0])],
-            f"mjx.step {hashlib.sha256(content.tobytes()).hexdigest()} {held}",
         )
+        identity = (f"mjx.step {hashlib.sha256(content.tobytes()).hexdigest()} {held}",)
         return Kernel(
             program,
             carried=len(arguments[0]),
@@ -296,6 +296,7 @@ class FusedMjx:
             ),
             explain=_explain,
             on_fallback=self._warn_once,
+            identity=identity,
         )
 
     def _warn_once(self, reason: str) -> None:

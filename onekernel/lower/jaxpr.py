@@ -122,7 +122,6 @@ class LateProgram(ScalarProgram):
         lower: Callable[[], ScalarProgram],
         input_shapes: Sequence[tuple[int, ...]],
         output_shapes: Sequence[tuple[int, ...]],
-        identity: str,
     ) -> None:
         """Describe a program.
 
@@ -130,12 +129,9 @@ class LateProgram(ScalarProgram):
           lower: lowers it.
           input_shapes: the shapes of the inputs.
           output_shapes: the shapes of the outputs.
-          identity: what it is lowered from, by which it is known in other processes.
         """
-        vars(self).update(_lower=lower, identity=identity)
-        vars(self).update(_inputs=list(input_shapes), _outputs=list(output_shapes))
-
-    identity: str
+        # The base class is frozen.
+        vars(self).update(_lower=lower, _inputs=[*input_shapes], _outputs=[*output_shapes])
 
     @functools.cached_property
     def lowered(self) -> ScalarProgram:
