@@ -286,7 +286,7 @@ class FusedMjx:
             [x.shape for x in leaves],
             [x.shape for x in jax.tree.leaves(arguments[0])],
         )
-        identity = (f"mjx.step {hashlib.sha256(content.tobytes()).hexdigest()} {held}",)
+        identity = f"mjx.step {hashlib.sha256(content.tobytes()).hexdigest()} {held}"
         return Kernel(
             program,
             carried=len(arguments[0]),

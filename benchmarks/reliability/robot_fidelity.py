@@ -78,7 +78,7 @@ def draw_actions(seed: int, robots: int, steps: int, size: int) -> Float[np.ndar
     """Draw actions at the limits, which each robot holds for a number of steps of its own."""
     rng = np.random.default_rng(seed)
     holds = rng.integers(1, LONGEST_HOLD + 1, robots)
-    limits = rng.choice(np.float32([-1.0, 1.0]), (robots, steps, size))
+    limits = rng.choice(np.array([-1.0, 1.0], np.float32), (robots, steps, size))
     turns = np.arange(steps) // holds[:, None]
     return np.take_along_axis(limits, turns[..., None], axis=1)
 
