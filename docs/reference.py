@@ -218,7 +218,10 @@ def _kind(schema: Mapping[str, Any], bounds: Sequence[str]) -> str:
     if "anyOf" in schema:
         return ", or ".join(_kind(one, bounds) for one in schema["anyOf"])
     if "$ref" in schema:
-        return f"section with {', '.join(_PARTS[schema['$ref'].rpartition('/')[2]].model_fields)}"
+        part = schema["$ref"].rpartition("/")[2]
+        if part == "JsonValue":
+            return "any value"
+        return f"section with {', '.join(_PARTS[part].model_fields)}"
     if "enum" in schema:
         return " or ".join(f"`{value}`" for value in schema["enum"])
     match schema["type"]:

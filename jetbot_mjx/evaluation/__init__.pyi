@@ -26,7 +26,6 @@ from .report import Report as Report
 from .result_names import name_with_count as name_with_count
 from .returns import ReturnEvaluator as ReturnEvaluator
 from .returns import ReturnSummary as ReturnSummary
-from .returns import return_baselines as return_baselines
 from .returns import summarize_returns as summarize_returns
 from .rollout import Episodes as Episodes
 from .rollout import rollout_fn as rollout_fn
