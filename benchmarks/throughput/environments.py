@@ -28,13 +28,13 @@ from benchmarks.harness.timing import (
     TimedProgram,
     add_tallies,
     env_keys,
-    sum_per_env,
 )
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config, parse_config
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import MissingPackageError, UserError
+from jetbot_mjx.packed import pack
 
 _LIBRARIES: Mapping[str, Mapping[str, object]] = {
     "Brax inverted_pendulum": {
@@ -81,18 +81,18 @@ def _prepare(config: Config, num_envs: int, sizes: Sizes) -> TimedProgram:
     table = jax.random.uniform(jax.random.PRNGKey(0), shape, minval=-1.0)
 
     def step(carry: Carry) -> Carry:
-        # The key counts the steps, whose actions repeat.
-        state = batch.step(carry.state, table[carry.key[1] % sizes.unroll])
-        outputs = (state.obs, state.reward, state.done, state.metrics, state.info)
+        # The key counts the steps, whose actions repeat. The state is passed on as in a training.
+        packed = batch.step_packed(carry.state, table[carry.key[1] % sizes.unroll])
+        state = packed.unpack()
         ends, lost = state.info["episode_done"], state.metrics["nonfinite_envs"]
-        tally = add_tallies(carry.tally, Tally(sum_per_env(outputs), ends, lost))
-        return Carry(state, carry.key + 1, tally)
+        tally = add_tallies(carry.tally, Tally(state.reward, ends, lost))
+        return Carry(packed, carry.key + 1, tally)
 
     def check(rate: str, carry: Carry) -> None:
         if lost := int(carry.tally.nonfinite.sum()):
             raise UserError(f"{config.environment}: {lost} states were not finite")
 
-    first = jax.jit(batch.reset)(env_keys(num_envs))
+    first = pack(jax.jit(batch.reset)(env_keys(num_envs)), batch_axes=1)
     return TimedProgram("env", step, first, n_substeps=1, calls=sizes.unroll, check=check)
 
 
