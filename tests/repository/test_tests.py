@@ -50,8 +50,6 @@ TOGETHER = {
     "envs/test_mjcf_robot": "envs.mjcf_wheels",
     "envs/test_mjx": "mjx_import",
     "evaluation/test_comparison": "evaluation.tables",
-    "evaluation/test_evaluate_returns": "evaluation.return_plots evaluation.return_report"
-    " evaluation.return_tables",
     "evaluation/test_evaluator": "evaluation.rollout",
     "evaluation/test_plots": "evaluation.learning_curves",
     "onekernel/test_fuse": "onekernel.explanation",
