@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.small_environments import Lever, OwnState, Point, adapted
+from helpers.own_environments import Lever, NoisyPoint, OwnState, adapted
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.adapted_env import AdaptedEnv
 from jetbot_mjx.envs.wrappers import wrap_for_training
@@ -32,7 +32,7 @@ def drive(env, actions, key=KEY):
 
 
 def test_only_what_a_step_reads_is_kept():
-    kept = adapted(Point).reset(KEY).pipeline_state.kept
+    kept = adapted(NoisyPoint).reset(KEY).pipeline_state.kept
     assert set(kept) == {"place", "info['key']", "info['count']"}
     assert kept["info['key']"].dtype == jnp.uint32
 
@@ -57,7 +57,7 @@ def test_what_a_step_reads_through_another_leaf_is_kept():
 
 @pytest.mark.parametrize("old_keys", [True, False])
 def test_a_trajectory_is_that_of_ones_own_reset_and_step(old_keys):
-    env, own = adapted(Point, **options(old_keys=old_keys)), Point(old_keys)
+    env, own = adapted(NoisyPoint, **options(old_keys=old_keys)), NoisyPoint(old_keys)
     actions = np.random.default_rng(0).uniform(-2, 2, (5, 2)).astype(np.float32)
     states = drive(env, actions)
     expected = jax.jit(own.reset)(jax.random.split(KEY)[1])
@@ -72,17 +72,17 @@ def test_a_trajectory_is_that_of_ones_own_reset_and_step(old_keys):
 
 
 def test_an_observation_is_joined_without_what_is_privileged():
-    env = adapted(Point)
+    env = adapted(NoisyPoint)
     assert (env.observation_size, env.action_size, env.layout[0].size) == (2, 2, 2)
     assert env.reset(KEY).obs.shape == (2,)
     assert env.observation_min_std is None
 
 
 def test_a_time_limit_of_its_own_is_a_truncation():
-    states = drive(adapted(Point, **options(limit=3, edge=9.0)), np.zeros((3, 2), np.float32))
+    states = drive(adapted(NoisyPoint, **options(limit=3, edge=9.0)), np.zeros((3, 2), np.float32))
     assert [float(state.done) for state in states] == [0, 0, 0, 1]
     assert [float(state.info["terminated"]) for state in states] == [0, 0, 0, 0]
-    batch = wrap_for_training(adapted(Point, **options(limit=3, edge=9.0)), episode_length=100)
+    batch = wrap_for_training(adapted(NoisyPoint, **options(limit=3, edge=9.0)), episode_length=100)
     state = jax.jit(batch.reset)(KEY[None])
     step = jax.jit(batch.step)
     for _ in range(3):
@@ -91,7 +91,7 @@ def test_a_time_limit_of_its_own_is_a_truncation():
 
 
 def test_an_end_by_failure_is_a_termination():
-    states = drive(adapted(Point, **options(edge=0.0)), np.ones((1, 2), np.float32))
+    states = drive(adapted(NoisyPoint, **options(edge=0.0)), np.ones((1, 2), np.float32))
     assert (float(states[-1].done), float(states[-1].info["terminated"])) == (1, 1)
 
 
@@ -109,7 +109,7 @@ def test_terminated_in_info_is_taken_as_it_is():
 
 
 def test_a_success_counts_once_in_an_episode():
-    env = adapted(Point, **options(edge=9.0))
+    env = adapted(NoisyPoint, **options(edge=9.0))
     assert env.has_success
     assert not adapted(Lever).has_success
     states = drive(env, np.ones((12, 2), np.float32))
@@ -121,7 +121,7 @@ def test_a_success_counts_once_in_an_episode():
 
 
 def test_each_episode_begins_elsewhere():
-    batch = wrap_for_training(adapted(Point, **options(edge=9.0)), episode_length=2)
+    batch = wrap_for_training(adapted(NoisyPoint, **options(edge=9.0)), episode_length=2)
     state = jax.jit(batch.reset)(jax.random.split(KEY, 4))
     step, starts = jax.jit(batch.step), [np.asarray(state.obs)]
     for count in range(6):
@@ -166,12 +166,12 @@ def test_a_step_that_changes_the_state_is_refused():
     ("environment", "kind", "told"),
     [
         (Lever, "tanh_normal", "its actions are 2 choices: set categorical"),
-        (Point, "categorical", "its actions are numbers: set tanh_normal"),
+        (NoisyPoint, "categorical", "its actions are numbers: set tanh_normal"),
     ],
 )
 def test_a_distribution_that_does_not_fit_is_refused(environment, kind, told):
     settings = {
-        "environment": f"helpers.small_environments:{environment.__name__}",
+        "environment": f"helpers.own_environments:{environment.__name__}",
         "ppo": {"network": {"distribution_type": kind}},
     }
     with pytest.raises(UserError, match=told):
@@ -179,16 +179,16 @@ def test_a_distribution_that_does_not_fit_is_refused(environment, kind, told):
 
 
 def test_what_it_says_of_itself():
-    env = adapted(Point)
+    env = adapted(NoisyPoint)
     assert repr(env) == (
-        "AdaptedEnv('helpers.small_environments:Point', observation_size=2, action_size=2)"
+        "AdaptedEnv('helpers.own_environments:NoisyPoint', observation_size=2, action_size=2)"
     )
     assert (env.dt, env.mj_model, env.backend, env.camera) == (None, None, "none", None)
-    Point.dt = 0.05
+    NoisyPoint.dt = 0.05
     try:
         assert env.dt == 0.05
     finally:
-        del Point.dt
+        del NoisyPoint.dt
 
 
 def test_a_state_of_mujoco_can_be_shown():

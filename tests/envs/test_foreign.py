@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.small_environments import GymnaxParams, Line, OwnState, Point
+from helpers.own_environments import GymnaxParams, Line, NoisyPoint, OwnState
 from jetbot_mjx.envs.foreign import as_foreign
 from jetbot_mjx.errors import InvalidError
 
@@ -73,7 +73,7 @@ def test_an_environment_of_gymnax_without_parameters_has_its_own():
 
 
 def test_the_size_of_an_action_is_told_or_that_of_the_model():
-    assert as_foreign(Point()).action_size == 2
+    assert as_foreign(NoisyPoint()).action_size == 2
     env = brax()
     del env.action_size
     env.mj_model = SimpleNamespace(nu=4)
