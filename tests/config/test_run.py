@@ -119,20 +119,26 @@ def test_an_environment_takes_what_is_not_of_the_robot(write, settings):
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ("environment: hopper.py", "environment = 'hopper.py' is wrong: write file.py:Class, with"),
+        ("environment: hopper.py", "with a file beside the configuration, or package.module:Class"),
         ("environment: hopper.Hopper", "or package.module:Class, perhaps hopper:Hopper"),
-        ("environment: 'my-env.py:Env'", "environment = 'my-env.py:Env' is wrong"),
-        ("environment: examples", "environment = 'examples' is wrong: write file.py:Class"),
-        ("environment: examples/", "environment = 'examples/' is wrong: write file.py:Class"),
-        ("environment: 3", "environment = 3 is wrong: it should be a text"),
+        (
+            "environment: 'my-env.py:Env'",
+            "environment: 'my-env.py:Env' is wrong: write file.py:Class",
+        ),
+        ("environment: examples", "environment: 'examples' is wrong: write file.py:Class"),
+        ("environment: examples/", "environment: 'examples/' is wrong: write file.py:Class"),
+        ("environment: 3", "environment = 3 is wrong: it should be text"),
         (
             f"{OWN}\ntask: {{observation: world, options: {{a: 1}}}}",
             "task.options = {'a': 1} is of",
         ),
         (f"{OWN}\ntask: {{name: my_task:Mine}}", "task.name = 'my_task:Mine' is of the JetBot"),
-        (f"{OWN}\nrobot: {{mass: 2}}", "robot.mass = 2.0 is of the JetBot, which environment ="),
+        (
+            f"{OWN}\nrobot: {{wheel_radius: 0.02}}",
+            "robot.wheel_radius = 0.02 is of the JetBot, which environment =",
+        ),
         (f"{OWN}\ncamera: {{width: 16}}", "camera.width = 16 is of the JetBot"),
-        (f"{OWN}\nphysics: {{timestep: 0.001}}", "physics.timestep = 0.001 is of the JetBot"),
+        (f"{OWN}\nphysics: {{tolerance: 0.001}}", "physics.tolerance = 0.001 is of the JetBot"),
         (f"{OWN}\nrandomization: {{mass: [0.9, 1.1]}}", "randomization.mass"),
         (f"{OWN}\nppo: {{normalizer: physical}}", "needs the units of the observation, which"),
         (f"{OWN}\nenvironment_options: {{1: 2}}", "environment_options"),
@@ -149,3 +155,4 @@ def test_what_does_not_fit_an_environment_is_refused(refusal, settings, told):
     message = refusal(settings)
     assert told in message
     assert "\n" not in message
+    assert "perhaps hopper:py" not in message
