@@ -22,6 +22,7 @@ from jax.interpreters import partial_eval
 from jaxtyping import Array, Float, PyTree, UInt32
 
 from jetbot_mjx.config import Config
+from jetbot_mjx.devices import default_device_cpu
 from jetbot_mjx.envs.checks.probe import changed_leaf, describe_error
 from jetbot_mjx.envs.foreign import SUCCESS, Foreign, Outcome, as_foreign
 from jetbot_mjx.envs.kernel_impl import KernelImpl
@@ -95,7 +96,10 @@ class AdaptedEnv(Env):
     def _told(self, who: str, call: Callable[[], Any]) -> Any:
         """Call code of the user, and tell its exceptions in one line."""
         try:
-            return call()
+            # Each operation outside of what is traced is a program of its own, which a GPU compiles
+            # for longer.
+            with default_device_cpu():
+                return call()
         except UserError as error:
             raise InvalidError(f"environment = {self.config.environment!r}: {error}") from None
         except Exception as error:
