@@ -62,6 +62,7 @@ from .task import RobotState as RobotState
 from .task import Task as Task
 from .task import layout_data as layout_data
 from .task import layout_table as layout_table
+from .task_template import write_environment_template as write_environment_template
 from .task_template import write_task_template as write_task_template
 from .versions import LIBRARIES as LIBRARIES
 from .versions import installed_version as installed_version

@@ -1,40 +1,59 @@
-"""A configuration describes a robot with its task, or an environment of one's own."""
+"""A configuration becomes the robot with its task, or an environment of one's own."""
 
 import pytest
 
-from helpers import own_environments
-from jetbot_mjx.config import parse_config
+from helpers.own_environments import NoisyPoint
+from jetbot_mjx.config import ConfigError, parse_config
 from jetbot_mjx.envs.adapted_env import AdaptedEnv
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.task import GoalTask
 from jetbot_mjx.errors import UserError
 
-
-def own(**options):
-    name = "helpers.own_environments:Point"
-    return parse_config({"environment": name, "environment_options": options})
+POINT = "helpers.own_environments:NoisyPoint"
 
 
-def test_a_robot_with_its_task_is_built():
-    assert type(make_env("smoke")) is JetBotEnv
+def test_a_robot_is_built_where_there_is_no_environment():
+    env = make_env("smoke")
+    assert type(env) is JetBotEnv
+    assert type(env.task) is GoalTask
 
 
 def test_an_environment_is_built_with_its_options():
-    env = make_env(own(start=1.0), {"environment_options.start": 2.5})
-    assert isinstance(env, AdaptedEnv)
-    assert env.source.start == 2.5
-    assert repr(env) == (
-        "AdaptedEnv('helpers.own_environments:Point', observation_size=2, action_size=1)"
-    )
+    env = make_env(parse_config({"environment": POINT, "environment_options": {"limit": 4}}))
+    assert type(env) is AdaptedEnv
+    assert (type(env.source), env.source.limit, env.source.edge) == (NoisyPoint, 4, 1.0)
 
 
-def test_a_class_that_was_imported_before_is_used():
-    class Mine(own_environments.Point):
+@pytest.mark.parametrize("name", [POINT, "nowhere:Nothing"])
+def test_a_class_that_is_given_is_not_imported(name):
+    class Other(NoisyPoint):
         pass
 
-    assert type(make_env(own(), own_class=Mine).source) is Mine
+    env = make_env(parse_config({"environment": name}), own_class=Other)
+    assert type(env.source) is Other
 
 
-def test_a_misspelt_option_is_told():
-    with pytest.raises(UserError, match=r"Point raises TypeError: .*'strat'"):
-        make_env(own(strat=2.5))
+def test_a_task_that_is_given_is_taken():
+    class Other(GoalTask):
+        pass
+
+    assert type(make_env("smoke", own_class=Other).task) is Other
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "told"),
+    [
+        ({"environment": "nowhere:Nothing"}, UserError, "there is no nowhere.py"),
+        ({"environment": "helpers.own_environments:jnp"}, UserError, "is no class and no func"),
+        (
+            {"environment": POINT, "environment_options": {"limits": 4}},
+            UserError,
+            "NoisyPoint raises TypeError: .* unexpected keyword argument 'limits'",
+        ),
+        ({"environment": 3}, ConfigError, "environment = 3"),
+    ],
+)
+def test_what_cannot_be_built_is_refused(settings, error, told):
+    with pytest.raises(error, match=told):
+        make_env(parse_config(settings))

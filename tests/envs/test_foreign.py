@@ -1,106 +1,132 @@
-"""Environments of other libraries, called in one way."""
+"""Environments of Brax's and Gymnax's interfaces, called in one way, without these libraries."""
 
-import types
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.own_environments import Gymlike, Named, Params, Point
+from helpers.own_environments import GymnaxParams, Line, NoisyPoint, OwnState
 from jetbot_mjx.envs.foreign import as_foreign
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import InvalidError
 
-KEY = jax.random.PRNGKey(0)
+KEY = jax.random.PRNGKey(2)
 
 
-def test_numbers_are_scaled_to_the_limits_of_gymnax_s_space():
-    one = as_foreign(Gymlike())
-    assert (one.action_size, one.is_discrete) == (2, False)
-    first = one.reset(KEY)
-    for action, given in (((-1, 1), (-2, 2)), ((0, 0), (1, 0)), ((0.5, -0.5), (2.5, -1))):
-        after = one.step(first.kept, jnp.float32(action))
-        np.testing.assert_allclose(after.obs[:2], given, atol=1e-6)
+def brax(**state):
+    """An environment whose reset and step return one state, but for what is given."""
+    zero = jnp.zeros(())
+    fields = {"obs": jnp.zeros(2), "reward": zero, "done": zero, "metrics": {}, "info": {}}
+    made = OwnState(zero, zero, **fields | state)
+    return SimpleNamespace(reset=lambda rng: made, step=lambda s, a: made, action_size=1)
+
+
+def test_numbers_of_an_action_are_scaled_to_the_space():
+    env = as_foreign((Line(discrete=False), GymnaxParams()))
+    assert (env.action_size, env.is_discrete) == (2, False)
+    begun = env.reset(KEY)
+    for action, taken in [((-1, -1), (-2, 0)), ((1, 1), (2, 10)), ((0, 0.5), (0, 7.5))]:
+        got = env.step(begun.kept, jnp.array(action, jnp.float32))
+        np.testing.assert_allclose(got.obs[1:], taken)
 
 
 def test_the_largest_number_chooses():
-    one = as_foreign(Gymlike(choices=3))
-    assert (one.action_size, one.is_discrete) == (3, True)
-    first = one.reset(KEY)
-    for action, choice in (((-1, -3, -2), 0), ((0, 0, 1), 2), ((0, 0.1, 0.05), 1)):
-        assert one.step(first.kept, jnp.float32(action)).obs[0] == choice
+    env = as_foreign((Line(discrete=True), GymnaxParams()))
+    assert (env.action_size, env.is_discrete) == (3, True)
+    begun = env.reset(KEY)
+    for choice in range(3):
+        got = env.step(begun.kept, jax.nn.one_hot(choice, 3))
+        np.testing.assert_array_equal(got.obs[1:], [choice, choice])
 
 
 def test_gymnax_s_time_limit_is_left_to_the_trainer():
-    one = as_foreign(Gymlike())
-    outcome = one.reset(KEY)
-    for _ in range(Params().max_steps_in_episode + 2):
-        outcome = one.step(outcome.kept, jnp.zeros(2))
-        assert (float(outcome.done), float(outcome.terminated)) == (0, 0)
-    # An end of its own is a termination.
-    (key, state), far = outcome.kept, jnp.float32(1e4)
-    outcome = one.step((key, state | {"x": far}), jnp.zeros(2))
-    assert (float(outcome.done), float(outcome.terminated)) == (1, 1)
+    env = as_foreign((Line(discrete=True), GymnaxParams(max_steps_in_episode=3)))
+    now = env.reset(KEY)
+    for _ in range(20):
+        now = env.step(now.kept, jnp.zeros(3))
+        assert (float(now.done), float(now.terminated)) == (0, 0)
+    # The limit would have ended it.
+    _, _, _, done, _ = Line(discrete=True).step_env(KEY, now.kept[1], 0, GymnaxParams())
+    assert bool(done)
 
 
-def test_gymnax_s_parameters_may_come_with_it():
-    still = as_foreign((Gymlike(), Params(gain=0.0)))
-    first = still.reset(KEY)
-    assert still.step(first.kept, jnp.zeros(2)).obs[2] == first.obs[2]
-    moving = as_foreign(Gymlike())
-    first = moving.reset(KEY)
-    one = moving.step(first.kept, jnp.zeros(2))
-    two = moving.step(one.kept, jnp.zeros(2))
-    assert len({float(x.obs[2]) for x in (first, one, two)}) == 3
+def test_gymnax_s_end_is_a_termination():
+    env = as_foreign((Line(discrete=True), GymnaxParams(edge=0.0)))
+    ended = env.step(env.reset(KEY).kept, jnp.zeros(3))
+    assert (float(ended.done), float(ended.terminated)) == (1, 1)
 
 
-def test_the_number_of_actions_may_be_the_model_s():
-    class Modelled(Point):
-        action_size = None
-        mj_model = types.SimpleNamespace(nu=5)
+def test_each_step_of_gymnax_draws_from_a_key_of_its_own():
+    env = as_foreign((Line(discrete=True), GymnaxParams()))
+    now, places = env.reset(KEY), []
+    for _ in range(8):
+        now = env.step(now.kept, jnp.zeros(3))
+        places.append(float(now.obs[0]))
+    assert len(set(np.diff(places))) == 7
+    again = env.step(env.reset(KEY).kept, jnp.zeros(3))
+    assert float(again.obs[0]) == places[0]
 
-    assert as_foreign(Modelled()).action_size == 5
-    assert as_foreign(Named()).action_size == 2
+
+def test_an_environment_of_gymnax_without_parameters_has_its_own():
+    assert as_foreign(Line(discrete=True)).action_size == 3
 
 
-def brax_like(**members):
-    """An environment whose state has these members."""
-    state = types.SimpleNamespace(obs=jnp.zeros(2), reward=0.0, done=0.0)
-    for name, value in members.items():
-        delattr(state, name) if value is None else setattr(state, name, value)
-    return types.SimpleNamespace(reset=lambda rng: state, step=lambda *_: state, action_size=1)
+def test_the_size_of_an_action_is_told_or_that_of_the_model():
+    assert as_foreign(NoisyPoint()).action_size == 2
+    env = brax()
+    del env.action_size
+    env.mj_model = SimpleNamespace(nu=4)
+    assert as_foreign(env).action_size == 4
 
 
 @pytest.mark.parametrize(
     ("source", "told"),
     [
-        (object(), "object is no environment: it lacks reset and step"),
-        (types.SimpleNamespace(reset=print), "SimpleNamespace is no environment: it lacks step"),
-        (
-            types.SimpleNamespace(reset=print, step=print),
-            "action_size = None is wrong: it should be a whole number",
-        ),
-        (
-            types.SimpleNamespace(reset=print, step=print, action_size=0),
-            "action_size = 0 is wrong: it should be a whole number",
-        ),
-        (brax_like(obs=None, done=None), "its state lacks obs, done"),
-        (
-            brax_like(obs={"image": jnp.zeros((4, 4, 3))}),
-            "observation['image'] has the shape [4, 4, 3]: it should be a vector, such as x.ravel",
-        ),
-        (brax_like(obs={"privileged_state": jnp.zeros(3)}), "observation is empty"),
-        (brax_like(obs=jnp.zeros(0)), "observation is empty"),
-        (
-            brax_like(reward=jnp.zeros(1)),
-            "reward has the shape [1]: it should be one number, of one instance",
-        ),
-        (brax_like(done=jnp.zeros(2)), "done has the shape [2]: it should be one number"),
-        (brax_like(metrics={"a": jnp.zeros(3)}), "metrics['a'] has the shape [3]"),
-        (brax_like(info={"truncation": jnp.zeros(1)}), 'info["truncation"] has the shape [1]'),
+        (3, "int is no environment: it lacks reset and step"),
+        (SimpleNamespace(reset=print), "SimpleNamespace is no environment: it lacks step"),
+        (SimpleNamespace(reset=print, step=print), "action_size = None is wrong"),
+        (SimpleNamespace(reset=print, step=print, action_size=0), "action_size = 0 is wrong"),
+        (SimpleNamespace(reset=print, step=print, action_size=(2,)), r"action_size = \(2,\) is"),
     ],
 )
-def test_what_breaks_the_interface_is_told(source, told):
-    with pytest.raises(UserError) as caught:
-        as_foreign(source).reset(KEY)
-    assert told in str(caught.value)
+def test_what_is_no_environment_is_refused(source, told):
+    with pytest.raises(InvalidError, match=told):
+        as_foreign(source)
+
+
+@pytest.mark.parametrize(
+    ("state", "told"),
+    [
+        ({"obs": jnp.zeros((3, 3))}, r"observation has the shape \[3, 3\]: it should be a vector"),
+        (
+            {"obs": {"a": jnp.zeros(2), "pixels": jnp.zeros((8, 8, 3))}},
+            r"observation\['pixels'\] has the shape \[8, 8, 3\]",
+        ),
+        ({"obs": jnp.zeros(0)}, "observation is empty"),
+        ({"obs": {"privileged_all": jnp.zeros(3)}}, "observation is empty"),
+        ({"reward": jnp.zeros(2)}, r"reward has the shape \[2\]: it should be one number"),
+        ({"done": jnp.zeros((1, 1))}, r"done has the shape \[1, 1\]"),
+        ({"metrics": {"speed": jnp.zeros(2)}}, r"metrics\['speed'\] has the shape \[2\]"),
+        ({"info": {"truncation": jnp.zeros(2)}}, r'info\["truncation"\] has the shape'),
+    ],
+)
+def test_a_result_of_the_wrong_shape_is_refused(state, told):
+    with pytest.raises(InvalidError, match=told):
+        as_foreign(brax(**state)).reset(KEY)
+
+
+def test_a_state_without_its_fields_is_refused():
+    env = SimpleNamespace(reset=lambda rng: jnp.zeros(3), step=print, action_size=1)
+    with pytest.raises(InvalidError, match="its state lacks obs, reward, done"):
+        as_foreign(env).reset(KEY)
+
+
+def test_success_in_info_becomes_a_metric():
+    got = as_foreign(brax(info={"success": True}, metrics={"speed": 2})).reset(KEY)
+    assert {name: float(x) for name, x in got.metrics.items()} == {"success": 1, "speed": 2}
+
+
+def test_parts_of_an_observation_are_joined_in_the_order_of_their_names():
+    parts = {"b": {"y": jnp.array([2.0]), "x": 1.0}, "a": jnp.array([0, 5]), "privileged_b": 9.0}
+    np.testing.assert_array_equal(as_foreign(brax(obs=parts)).reset(KEY).obs, [0, 5, 1, 2])

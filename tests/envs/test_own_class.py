@@ -1,50 +1,76 @@
-"""The class that a configuration names is imported, and what is wrong with its name is told."""
+"""The import of a class of one's own, and what is said where it fails."""
 
 import sys
 
 import pytest
 
+from jetbot_mjx.config import task_modules
 from jetbot_mjx.envs.own_class import import_class
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import InvalidError, MissingPackageError
+
+FILES = {
+    "own_sound.py": "class Env:\n    class Inner:\n        pass\n",
+    "own_needy.py": "import own_absent_package\n",
+    "own_half.py": "class Env(:\n",
+    "own_package/__init__.py": "",
+    "own_package/inside.py": "class Env:\n    pass\n",
+}
 
 
-@pytest.fixture
-def home(tmp_path, monkeypatch):
-    """The current folder, with two modules; none is imported when the test ends."""
-    (tmp_path / "of_mine.py").write_text("class Outer:\n    class Inner:\n        pass\n")
-    (tmp_path / "of_theirs.py").write_text("import not_installed_anywhere\n")
-    (tmp_path / "half_mine.py").write_text("class Half(:\n")
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    """The current folder, with some modules; what they leave in the process is undone."""
+    for name, text in FILES.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    yield tmp_path
-    for name in ("of_mine", "of_theirs", "half_mine"):
-        sys.modules.pop(name, None)
-
-
-@pytest.mark.parametrize("name", ["Outer", "Outer.Inner"])
-def test_a_class_is_found_in_the_current_folder(home, name):
-    assert import_class("environment", f"of_mine:{name}").__qualname__ == name
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    monkeypatch.setattr(task_modules, "TASK_FOLDERS", {})
+    yield
+    for name in [name for name in sys.modules if name.startswith("own_")]:
+        del sys.modules[name]
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "found"),
     [
-        ("of_mine.Outer", "is wrong: write package.module:Class, perhaps of_mine:Outer"),
-        (":Outer", "is wrong: write package.module:Class"),
-        (".of_mine:Outer", "is wrong: write package.module:Class"),
-        ("of_mine:", "is wrong: write package.module:Class"),
-        ("of_mine.py:Outer", "names a file: write the module, of_mine:Outer"),
-        ("of_mime:Outer", "there is no of_mime.py beside the YAML file or in the current folder"),
-        ("of_mime:Outer", "and no such package: did you mean of_mine:Outer?"),
-        ("of_theirs:Their", "of_theirs imports 'not_installed_anywhere', which is not installed"),
-        ("half_mine:Half", "half_mine.py, line 1, is not valid Python: invalid syntax"),
-        ("of_mine:Outre", "of_mine has no 'Outre': did you mean 'Outer'?"),
-        ("of_mine:Outer.Iner", "Outer has no 'Iner': did you mean 'Inner'?"),
+        ("own_sound:Env", "Env"),
+        ("own_sound:Env.Inner", "Env.Inner"),
+        ("own_package.inside:Env", "Env"),
+        ("collections:OrderedDict", "OrderedDict"),
     ],
 )
-def test_a_wrong_name_is_told(home, name, told):
-    with pytest.raises(UserError) as caught:
-        import_class("task.name", name)
-    assert str(caught.value).startswith(f"task.name = {name!r}")
-    assert told in str(caught.value)
-    assert len(str(caught.value).splitlines()) == 1
+def test_a_class_is_found(name, found):
+    assert import_class("environment", name).__qualname__ == found
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "told"),
+    [
+        ("own_sound", InvalidError, "write package.module:Class$"),
+        ("own_sound.Env", InvalidError, "write package.module:Class, perhaps own_sound:Env$"),
+        (":Env", InvalidError, "write package.module:Class$"),
+        ("own_sound:", InvalidError, "write package.module:Class$"),
+        (".own_sound:Env", InvalidError, "write package.module:Class$"),
+        ("own_sound.py:Env", InvalidError, "names a file: write the module, own_sound:Env$"),
+        ("own_sound:env", InvalidError, "own_sound has no 'env': did you mean 'Env'[?]$"),
+        ("own_sound:Env.Other", InvalidError, "Env has no 'Other'$"),
+        ("own_half:Env", InvalidError, r"own_half.py, line 1, is not valid Python: "),
+        (
+            "own_soud:Env",
+            MissingPackageError,
+            "there is no own_soud.py beside the YAML file or in the current folder, and no such"
+            " package: did you mean own_sound:Env[?]$",
+        ),
+        ("own_package.nothing:Env", MissingPackageError, "there is no own_package/nothing.py"),
+        (
+            "own_needy:Env",
+            MissingPackageError,
+            "own_needy imports 'own_absent_package', which is not installed: install it$",
+        ),
+    ],
+)
+def test_what_cannot_be_imported_is_one_line(name, error, told):
+    with pytest.raises(error, match=f"^environment = '{name}'.*{told}") as caught:
+        import_class("environment", name)
+    assert "\n" not in str(caught.value)

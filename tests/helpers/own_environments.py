@@ -1,12 +1,15 @@
-"""Small environments of one's own in plain JAX, one of each kind that the package takes."""
+"""Environments of one's own, as small as can be, and what stands in for libraries of others."""
 
-import types
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from jetbot_mjx import State
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs.adapted_env import AdaptedEnv
 
 ZERO = jnp.zeros(())
 
@@ -34,103 +37,128 @@ class Point:
         return State(inside, jnp.stack([x, speed]), 1.0 - x**2, done, metrics)
 
 
-class Walk:
-    """A random walk whose random key is in `info`, of the kind that `typed` asks for."""
+@struct.dataclass
+class OwnState:
+    """A state that is not this package's."""
 
-    action_size = 1
-
-    def __init__(self, typed):
-        self.typed = typed
-
-    def reset(self, rng):
-        key = jax.random.wrap_key_data(rng) if self.typed else rng
-        return State(ZERO, jnp.zeros(1), ZERO, ZERO, {}, {"key": key})
-
-    def step(self, state, action):
-        key, now = jax.random.split(state.info["key"])
-        x = state.pipeline_state + jax.random.normal(now)
-        return state.replace(pipeline_state=x, obs=x[None], info={"key": key})
+    place: jax.Array
+    unread: jax.Array
+    obs: object
+    reward: jax.Array
+    done: jax.Array
+    metrics: dict
+    info: dict
 
 
-class Told:
-    """An environment that says in `info` and `metrics` whatever a test has it say of step t."""
-
-    action_size = 1
-
-    def __init__(self, info=None, metrics=None, done=()):
-        self.info, self.metrics, self.ends = info or {}, metrics or {}, done
-
-    def reset(self, rng):
-        return self.state(jnp.int32(0))
-
-    def step(self, state, action):
-        return self.state(state.pipeline_state + 1)
-
-    def state(self, t):
-        def at(steps):
-            return jnp.any(t == jnp.array([*steps, -1])).astype(jnp.float32)
-
-        told = [{name: at(steps) for name, steps in x.items()} for x in (self.metrics, self.info)]
-        return State(t, jnp.float32(t)[None], ZERO, at(self.ends), *told)
-
-
-class Named:
-    """An environment whose observation has names, one of which only a simulator knows."""
+class NoisyPoint:
+    """A point on a line, which its action moves, and noise; it has a time limit of its own."""
 
     action_size = 2
 
+    def __init__(self, old_keys=False, limit=6, edge=1.0):
+        self.old_keys, self.limit, self.edge = old_keys, limit, edge
+
     def reset(self, rng):
-        return self.state(jnp.zeros(2))
+        if not self.old_keys:
+            rng = jax.random.wrap_key_data(rng, impl="threefry2x32")
+        key, own = jax.random.split(rng)
+        place = 0.5 * jax.random.uniform(own, (2,), minval=-1.0)
+        zero = jnp.zeros(())
+        info = {"key": key, "count": 0, "success": zero, "truncation": zero}
+        return OwnState(place, place, self.observe(place), zero, zero, {"distance": zero}, info)
 
     def step(self, state, action):
-        return self.state(state.pipeline_state + action)
+        key, own = jax.random.split(state.info["key"])
+        place = state.place + 0.1 * action + 0.01 * jax.random.normal(own, (2,))
+        count = state.info["count"] + 1
+        beyond = (jnp.abs(place).max() > self.edge).astype(jnp.float32)
+        late = (count >= self.limit) * (1.0 - beyond)
+        info = {
+            "key": key,
+            "count": count,
+            "success": (place[0] > 0).astype(jnp.float32),
+            "truncation": late,
+        }
+        distance = jnp.linalg.norm(place)
+        return OwnState(
+            place,
+            place**2,
+            self.observe(place),
+            -distance,
+            jnp.maximum(beyond, late),
+            {"distance": distance},
+            info,
+        )
 
-    def state(self, x):
-        obs = {"velocity": 2.0 * x, "height": x[0], "privileged_state": jnp.full(7, 3.0)}
-        return State(x, obs, ZERO, ZERO)
+    def observe(self, place):
+        return {"velocity": place[:1], "angle": place[1], "privileged_state": jnp.ones(7)}
 
 
-class Params(NamedTuple):
-    """The parameters of a `Gymlike`."""
+class Lever:
+    """Two choices, of which one is right; the state is a single number."""
 
-    gain: float = 1.0
-    max_steps_in_episode: int = 3
+    action_size = 2
+    discrete_actions = True
+
+    def reset(self, rng):
+        zero = jnp.zeros(())
+        return OwnState(zero, zero, zero, zero, zero, {}, {})
+
+    def step(self, state, action):
+        return state.replace(place=state.place + 1.0, reward=action[1] - action[0])
+
+
+def adapted(environment, **settings):
+    """The environment of a class in this file, or of the one that is given."""
+    kind = "categorical" if getattr(environment, "discrete_actions", False) else "tanh_normal"
+    config = {
+        "environment": f"{__name__}:{environment.__name__}",
+        "ppo": {"network": {"distribution_type": kind}},
+        **settings,
+    }
+    return AdaptedEnv(parse_config(config), environment)
+
+
+class GymnaxParams(NamedTuple):
+    """Parameters of an environment with Gymnax's interface."""
+
+    max_steps_in_episode: int = 5
+    edge: float = 9.0
 
     def replace(self, **changes):
         return self._replace(**changes)
 
 
-class Gymlike:
-    """An environment in the form of Gymnax's: parameters, a key in every step, and spaces."""
+class LineState(NamedTuple):
+    place: jax.Array
+    time: jax.Array
 
-    default_params = Params()
 
-    def __init__(self, choices=0):
-        self.choices = choices
+class Line:
+    """An environment with Gymnax's interface: noise on a line, and the action in the observation.
+
+    It counts its time limit among the ends, as Gymnax does.
+    """
+
+    default_params = GymnaxParams()
+
+    def __init__(self, discrete):
+        low, high = jnp.array([-2.0, 0.0]), jnp.array([2.0, 10.0])
+        box = SimpleNamespace(low=low, high=high, shape=(2,))
+        self.space = SimpleNamespace(n=3) if discrete else box
 
     def action_space(self, params):
-        if self.choices:
-            return types.SimpleNamespace(n=self.choices)
-        return types.SimpleNamespace(low=-2.0, high=jnp.array([4.0, 2.0]), shape=(2,))
+        return self.space
 
     def reset_env(self, key, params):
-        state = {"x": jax.random.uniform(key), "t": 0, "action": jnp.zeros(self.shape)}
-        return self.observe(state), state
+        state = LineState(0.1 * jax.random.normal(key), 0)
+        return self.observe(state, jnp.zeros(2)), state
 
     def step_env(self, key, state, action, params):
-        x, t = state["x"] + params.gain * jax.random.normal(key), state["t"] + 1
-        state = {"x": x, "t": t, "action": jnp.asarray(action, jnp.float32)}
-        done = (t >= params.max_steps_in_episode) | (x > 100.0)
-        return self.observe(state), state, x, done, {}
+        state = LineState(state.place + 0.1 * jax.random.normal(key), state.time + 1)
+        done = jnp.abs(state.place) > params.edge
+        done |= state.time >= params.max_steps_in_episode
+        return self.observe(state, action), state, -jnp.abs(state.place), done, {"discount": 1.0}
 
-    @property
-    def shape(self):
-        return () if self.choices else (2,)
-
-    def observe(self, state):
-        return jnp.append(state["action"].ravel(), state["x"])
-
-
-def gymlike(choices=0, gain=1.0):
-    """An environment with its parameters, as `gymnax.make` returns them."""
-    return Gymlike(choices), Params(gain)
+    def observe(self, state, action):
+        return jnp.append(state.place, jnp.broadcast_to(action, (2,)))
