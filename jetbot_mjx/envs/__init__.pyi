@@ -9,6 +9,9 @@ from .camera.wrapper import NUMBERS as NUMBERS
 from .camera.wrapper import PIXELS as PIXELS
 from .camera.wrapper import see as see
 from .camera.wrapper import with_camera as with_camera
+from .checks.own_environment import ENVIRONMENT_CHECKS as ENVIRONMENT_CHECKS
+from .checks.own_environment import check_environment as check_environment
+from .checks.own_environment import require_sound as require_sound
 from .checks.runner import CHECKS as CHECKS
 from .checks.runner import check_task as check_task
 from .checks.runner import require_trainable as require_trainable
@@ -59,6 +62,7 @@ from .task import RobotState as RobotState
 from .task import Task as Task
 from .task import layout_data as layout_data
 from .task import layout_table as layout_table
+from .task_template import write_environment_template as write_environment_template
 from .task_template import write_task_template as write_task_template
 from .versions import LIBRARIES as LIBRARIES
 from .versions import installed_version as installed_version

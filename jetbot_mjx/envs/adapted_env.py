@@ -116,7 +116,7 @@ class AdaptedEnv(Env):
 
         def reset(rng: Array) -> Outcome:
             outcome = one.reset(rng)
-            kinds.append(jax.tree.map(jax.typeof, jax.tree.map(jnp.asarray, outcome.kept)))
+            kinds.append(jax.tree.map(_kind, outcome.kept))
             return _with_words(outcome)
 
         def step(words: PyTree, action: Array) -> Outcome:
@@ -127,8 +127,9 @@ class AdaptedEnv(Env):
         step_jaxpr, following = self._told("step", lambda: _make_jaxpr(step, first.kept, action))
         if unlike := changed_leaf(first, following):
             raise InvalidError(
-                f"environment = {self.config.environment!r}: a step changes the state's {unlike}:"
-                " keep names, tree, shapes and dtypes as reset has them"
+                f"environment = {self.config.environment!r}: a step changes the state's"
+                f" {unlike.removeprefix('kept.')}: keep names, tree, shapes and dtypes as reset has"
+                " them"
             )
         # Of what is kept, only some is read; of the rest of an outcome, all is.
         paths = jax.tree_util.tree_leaves_with_path(first.kept)
@@ -321,11 +322,14 @@ def _as_words(x: Any) -> Array:
     return jax.random.key_data(array) if _is_key(array.dtype) else array.astype(array.dtype)
 
 
+def _kind(x: Any) -> Any:
+    """Return the implementation of random keys, or "" for numbers."""
+    return jax.random.key_impl(x) if _is_key(jnp.asarray(x).dtype) else ""
+
+
 def _from_words(kind: Any, words: Array) -> Array:
     """Return an array of a kind; the inverse of `_as_words`."""
-    if not _is_key(kind.dtype):
-        return words
-    return jax.random.wrap_key_data(words, impl=jax.random.key_impl(kind))
+    return words if kind == "" else jax.random.wrap_key_data(words, impl=kind)
 
 
 def _is_key(dtype: Any) -> bool:

@@ -19,7 +19,8 @@ from jetbot_mjx.errors import UserError
 
 FILE_OR_NAME = (
     "give a file, or one of camera_gpu, camera_real, gpu, isaac_sb3, jetbot, jetbot_camera,"
-    " jetbot_egocentric, real_jetbot, smoke, car, gates, obstacle, pillars, rover, turtlebot"
+    " jetbot_egocentric, real_jetbot, smoke, car, cartpole, gates, half_cheetah, hopper, obstacle,"
+    " pillars, reacher, rover, turtlebot, walker"
 )
 
 

@@ -332,7 +332,7 @@ def test_the_page_about_real_robots_leads_to_a_comparison(reader, real_run, monk
 def test_documented_tasks_are_written_and_checked(tmp_path):
     found = [
         one.values
-        for name in ("new_task", "check_env", "new_robot", "check_robot")
+        for name in ("new_task", "new_env", "check_env", "new_robot", "check_robot")
         for one in of_kind("python", "-m", f"jetbot_mjx.{name}")
     ]
     assert len(found) == 4
@@ -357,7 +357,8 @@ def test_no_kind_of_command_is_left_out():
     elsewhere = {("pip", "install"), ("apt-get", "install"), ("[", "$?"), ("break",), ("srun",)}
     elsewhere |= {("scp",), ("git", "clone"), ("cd",)}
     covered = {"train", "evaluate", "render", "replay", "play", "plan", "export", "sim2real"}
-    covered |= {"new_task", "check_env", "new_robot", "check_robot", "pretrained", "jetbot_mjx"}
+    covered |= {"new_task", "new_env", "check_env", "new_robot", "check_robot", "pretrained"}
+    covered.add("jetbot_mjx")
     # Tested by test_list_configs.py, test_list_runs.py and test_tune.py.
     covered |= {"configs", "runs", "tune"}
     for text, (_, words) in DOCUMENTED.items():
