@@ -113,11 +113,11 @@ def test_a_mistake_is_one_line_and_nothing_is_written(type_, name):
             " (fails_to_import.py:1)",
         ),
         (
-            "environment: helpers.broken_environments:sound\nenvironment_options: {strat: 1}\n",
-            "sound raises TypeError: sound() got an unexpected keyword argument 'strat'",
+            "environment: helpers.broken_environments:Sound\nenvironment_options: {strat: 1}\n",
+            "Sound raises TypeError: Point.__init__() got an unexpected keyword argument 'strat'",
         ),
         (
-            "environment: helpers.broken_environments:sound\n"
+            "environment: helpers.broken_environments:Sound\n"
             "ppo: {network: {distribution_type: categorical}}\n",
             "its actions are numbers: set tanh_normal",
         ),
@@ -137,7 +137,7 @@ def test_a_rare_state_that_is_not_finite_is_left_to_the_training():
 
 
 def test_each_check_is_told_up_to_the_first_with_findings():
-    assert dict(check_environment(config_of("sound"))) == {x: [] for x in ENVIRONMENT_CHECKS}
+    assert dict(check_environment(config_of("Sound"))) == {x: [] for x in ENVIRONMENT_CHECKS}
     found = list(check_environment(config_of("CountsInItself")))
     assert [name for name, _ in found] == ["interface", "purity"]
     assert [len(findings) for _, findings in found] == [0, 1]
@@ -159,5 +159,5 @@ def test_what_was_trained_before_is_not_driven_again(tmp_path, monkeypatch):
     for cached in (False, True):
         monkeypatch.setattr(session.ProgramCache, "has", lambda self, name, has=cached: has)
         with pytest.raises(Found):
-            session.run(config_of("sound"), tmp_path / "run")
+            session.run(config_of("Sound"), tmp_path / "run")
     assert len(drives) == 1

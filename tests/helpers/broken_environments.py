@@ -253,6 +253,13 @@ class IsRarelyNotFinite(Point):
         )
 
 
-def sound():
+class Sorts(Point):
+    """What one kernel cannot do is no mistake."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return after.replace(reward=after.reward + jnp.linalg.eigh(jnp.diag(after.obs))[0][0])
+
+
+class Sound(Point):
     """Nothing is wrong with this one."""
-    return Point()
