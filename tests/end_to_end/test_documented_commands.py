@@ -153,7 +153,7 @@ def execute(page, words, reader, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Brax System")
+@pytest.mark.filterwarnings("ignore:Brax System", "ignore:Accessing")
 @pytest.mark.parametrize(("page", "words"), of_kind("python", "-m", "jetbot_mjx.train"))
 def test_a_documented_training_trains(page, words, reader, monkeypatch, capsys):
     if "wandb=jetbots" in words:
