@@ -23,6 +23,13 @@ if TYPE_CHECKING:
     from jetbot_mjx.agents import Policy
     from jetbot_mjx.runs import Which
 
+    _Evaluated = (
+        evaluation.Report
+        | evaluation.ReturnReport
+        | evaluation.Comparison
+        | evaluation.ReturnComparison
+    )
+
 _FITTING = {
     "strip": ("many",),
     "gallery": ("episodes",),
@@ -81,14 +88,14 @@ def train(
 @overload
 def evaluate(
     runs: str | Path, *, verbose: bool = ..., **options: "Unpack[evaluation.ReportOptions]"
-) -> "evaluation.Report": ...
+) -> "evaluation.Report | evaluation.ReturnReport": ...
 @overload
 def evaluate(
     runs: Sequence[str | Path],
     *,
     verbose: bool = ...,
     **options: "Unpack[evaluation.ReportOptions]",
-) -> "evaluation.Comparison": ...
+) -> "evaluation.Comparison | evaluation.ReturnComparison": ...
 def evaluate(
     runs: str | Path | Sequence[str | Path],
     *,
@@ -99,7 +106,7 @@ def evaluate(
     ranges: str | Path | None = None,
     simulator: "evaluation.Simulator | None" = None,
     verbose: bool = False,
-) -> "evaluation.Report | evaluation.Comparison":
+) -> "_Evaluated":
     """Evaluate a policy on the fixed goals and write its report, or compare several runs.
 
     Args:
@@ -116,8 +123,8 @@ def evaluate(
       verbose: whether to show the progress.
 
     Returns:
-      The report of one run, or the comparison of a list of runs. Both name the folder of their
-      files.
+      The report of one run, or the comparison of a list of runs; of returns, where the runs have an
+      `environment`. Both name the folder of their files.
 
     Raises:
       UserError: a run or argument is wrong, the runs cannot be compared, or a folder cannot be

@@ -53,7 +53,7 @@ def success_table(results: Results) -> str:
         "time to {target}",
     )
     rows, targets = [], set()
-    for values in _files_with(results, "runs"):
+    for values in _robots(results):
         targets.add(values["target"])
         # The oldest files do not say that each start was cold.
         for start in dict.fromkeys(run.get("start", "cold") for run in values["runs"]):
@@ -71,7 +71,7 @@ def summary_table(results: Results) -> str:
     range of the medians.
     """
     hosts: dict[tuple[str, str], list[list[Any]]] = {}
-    for values in _files_with(results, "runs"):
+    for values in _robots(results):
         runs = [run for run in values["runs"] if run.get("start") == "warm"]
         if runs and values["config"]["trainer"] == "resumable":
             key = _machine(values, runs[0]["versions"]), values["config"]["task"]["observation"]
@@ -240,6 +240,12 @@ def _machine(values: Mapping[str, Any], device: Mapping[str, Any]) -> str:
     if device["device"] == "cpu":
         return f"{values['cpu_cores']} CPU cores"
     return f"{device['device_count']} {device['device']}"
+
+
+def _robots(results: Results) -> list[Mapping[str, Any]]:
+    """Return the files of `time_to_success.py` about robots, not about other environments."""
+    files = _files_with(results, "runs")
+    return [values for values in files if values["config"].get("environment") is None]
 
 
 def _files_with(results: Results, key: str) -> list[Mapping[str, Any]]:

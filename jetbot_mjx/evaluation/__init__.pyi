@@ -24,6 +24,8 @@ from .plots import theme as theme
 from .plots import to_png as to_png
 from .report import Report as Report
 from .result_names import name_with_count as name_with_count
+from .return_report import ReturnComparison as ReturnComparison
+from .return_report import ReturnReport as ReturnReport
 from .returns import ReturnEvaluator as ReturnEvaluator
 from .returns import ReturnSummary as ReturnSummary
 from .returns import summarize_returns as summarize_returns

@@ -155,8 +155,12 @@ def _task_settings(config: Config) -> JsonObject:
     }
 
 
-def _differences(configs: Sequence[Config]) -> dict[str, Sequence[object]]:
-    """Return the values of each run, by key, for the settings in which runs differ."""
+def differing_settings(configs: Sequence[Config]) -> dict[str, Sequence[object]]:
+    """Return the values of each run, by key, for the settings in which runs differ.
+
+    Args:
+      configs: the configuration of each run.
+    """
     flat = [config.flat() for config in configs]
     keys = dict.fromkeys(key for one in flat for key in one if key not in ("seed", "seeds"))
     found = {key: [one.get(key) for one in flat] for key in keys}
@@ -185,7 +189,9 @@ def compare(folder: Path, runs: Mapping[str, Mapping[str, Report]]) -> Compariso
         settings={"robot": first.config.robot.label, **_task_settings(first.config)},
         runs=rows,
         pairs=tuple(_pair(a, b) for a, b in itertools.combinations(rows, 2)),
-        differences=_differences([next(iter(seeds.values())).config for seeds in runs.values()]),
+        differences=differing_settings(
+            [next(iter(seeds.values())).config for seeds in runs.values()]
+        ),
         baselines=first.baselines,
         versions=first.versions,
     )
@@ -209,8 +215,8 @@ def _run(name: str, seeds: Mapping[str, Report]) -> Run:
     if len(reports) == 1:
         success, time = _of_one_seed(reports[0])
     else:
-        success = _over_seeds([one.policy.success_rate for one in reports])
-        time = _over_seeds(_times(reports))
+        success = aggregate_seeds([one.policy.success_rate for one in reports])
+        time = aggregate_seeds(_times(reports))
     return Run(name, seeds, success, time, _band([one.learning_curve for one in reports]))
 
 
@@ -232,7 +238,12 @@ def _of_one_seed(report: Report) -> tuple[Aggregate, Aggregate]:
     )
 
 
-def _over_seeds(values: Sequence[float]) -> Aggregate:
+def aggregate_seeds(values: Sequence[float]) -> Aggregate:
+    """Return a quantity of one run over its seeds.
+
+    Args:
+      values: the value of each seed.
+    """
     return Aggregate(
         "seeds",
         len(values),
@@ -269,8 +280,8 @@ def _pair(a: Run, b: Run) -> Pair:
         a.name,
         b.name,
         seeds,
-        _compare_pairwise(success[0], success[1], rate_a > rate_b, rate_a < rate_b),
-        _compare_pairwise(
+        compare_pairwise(success[0], success[1], rate_a > rate_b, rate_a < rate_b),
+        compare_pairwise(
             _times(ours),
             _times(theirs),
             (steps_a < steps_b)[both],
@@ -291,7 +302,7 @@ def _success_by_goal(
     return reached / len(reports), (won * steps).sum(axis=0) / np.maximum(reached, 1)
 
 
-def _compare_pairwise(
+def compare_pairwise(
     a: Sequence[float],
     b: Sequence[float],
     better: Bool[np.ndarray, " n"],
@@ -299,6 +310,15 @@ def _compare_pairwise(
     *,
     less_is_better: bool = False,
 ) -> PairwiseResult:
+    """Compare two runs in one quantity.
+
+    Args:
+      a: the value of each seed of the first run.
+      b: that of each seed of the second run.
+      better: for each goal or start, whether the first run did better.
+      worse: whether the second one did.
+      less_is_better: whether a smaller value is better.
+    """
     wins, losses = int(better.sum()), int(worse.sum())
     several = len(a) > 1 and len(b) > 1
     order = (b, a) if less_is_better else (a, b)

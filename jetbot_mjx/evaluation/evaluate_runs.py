@@ -7,10 +7,11 @@ from typing import Literal, NamedTuple, TypedDict, Unpack, get_args
 import jax
 
 from jetbot_mjx import runs
-from jetbot_mjx.config import RandomizationConfig, load_config
+from jetbot_mjx.config import Config, RandomizationConfig, load_config
 from jetbot_mjx.envs import OTHER_NUMERICS, DomainRandomizationWrapper, Numerics
 from jetbot_mjx.errors import InvalidError, UserError
 from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compare
+from jetbot_mjx.evaluation.evaluate_returns import compare_return_runs, write_returns
 from jetbot_mjx.evaluation.evaluator import BASELINES, Evaluator, report_keys, summarize
 from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
 from jetbot_mjx.evaluation.html_report import write_comparison, write_report
@@ -23,6 +24,7 @@ from jetbot_mjx.evaluation.report import (
     learning_curve,
 )
 from jetbot_mjx.evaluation.result_names import find_report, name_with_count, report_folder
+from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
 from jetbot_mjx.evaluation.robustness import SWEEP_GOALS, MujocoEvaluator, MujocoResult, Sweeper
 from jetbot_mjx.runs import Checkpoint, JsonObject, Setup, Which, check_writable, load_checkpoint
 from jetbot_mjx.terminal import stage
@@ -54,7 +56,9 @@ class ReportOptions(TypedDict, total=False):
     """Second simulator in which a policy is evaluated too, or None."""
 
 
-def evaluate_run(run_or_checkpoint: str | Path, **options: Unpack[ReportOptions]) -> Report:
+def evaluate_run(
+    run_or_checkpoint: str | Path, **options: Unpack[ReportOptions]
+) -> Report | ReturnReport:
     """Evaluate one policy and write its report.
 
     Args:
@@ -62,13 +66,17 @@ def evaluate_run(run_or_checkpoint: str | Path, **options: Unpack[ReportOptions]
       **options: What to evaluate, and where to write it.
 
     Returns:
-      The report, which names its folder.
+      The report, which names its folder: of returns, if the run has an `environment`.
 
     Raises:
-      UserError: there is no usable checkpoint, or the folder cannot be written.
+      UserError: there is no usable checkpoint, an option is for robots and the run has an
+        `environment`, or the folder cannot be written.
     """
     reporter = _Reporter(**options)
     checkpoint = load_checkpoint(run_or_checkpoint, reporter.which)
+    if checkpoint.config.environment is not None:
+        _check_returns(checkpoint.config, options)
+        return write_returns(checkpoint, reporter.episodes, reporter.output)
     check_writable(Path(reporter.output or checkpoint.results_dir / _FOLDER))
     return reporter.write(checkpoint, checkpoint.make_setup(), reporter.output)
 
@@ -105,7 +113,23 @@ def evaluate_in_mujoco(
     return evaluator.run(checkpoint.params, report_keys(episodes))
 
 
-def compare_runs(runs: Sequence[str | Path], **options: Unpack[ReportOptions]) -> Comparison:
+def _check_returns(config: Config, options: ReportOptions) -> None:
+    """Raise an error if options ask for what only robots have.
+
+    Raises:
+      InvalidError: one of them does.
+    """
+    for name in ("robustness", "simulator", "ranges"):
+        if options.get(name):
+            raise InvalidError(
+                f"{name} is for robots, and the run has environment = {config.environment!r}:"
+                f" leave out --{name}"
+            )
+
+
+def compare_runs(
+    runs: Sequence[str | Path], **options: Unpack[ReportOptions]
+) -> Comparison | ReturnComparison:
     """Evaluate the policies of several runs or seeds, write a report on each, and compare them.
 
     The report on a policy is not written again if there is one that is at least as full.
@@ -118,14 +142,19 @@ def compare_runs(runs: Sequence[str | Path], **options: Unpack[ReportOptions]) -
       The comparison, which names its folder. Each of its reports names its own.
 
     Raises:
-      UserError: a checkpoint cannot be used or is named twice, the runs have different tasks, or a
-        folder cannot be written.
+      UserError: a checkpoint cannot be used or is named twice, the runs have different tasks or
+        environments, or a folder cannot be written.
     """
     reporter = _Reporter(**options)
     # Load all policies and check that they can be compared.
     entries = _load_runs([Path(path) for path in runs], reporter.which)
-    check_comparable({name: entry.first.config for name, entry in entries.items()})
     first = next(iter(entries.values())).folder
+    for entry in entries.values():
+        if (config := entry.first.config).environment is not None:
+            _check_returns(config, options)
+            seeds = {name: one.seeds for name, one in entries.items()}
+            return compare_return_runs(seeds, first, reporter.episodes, reporter.output)
+    check_comparable({name: entry.first.config for name, entry in entries.items()})
     name = name_with_count("comparison", reporter.episodes, REPORT_GOALS, "-goals")
     folder = Path(reporter.output or first / _FOLDER / name)
     # Build all environments first, so that an unsuitable policy is rejected before any writing.

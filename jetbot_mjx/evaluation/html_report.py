@@ -15,10 +15,11 @@ from jaxtyping import PyTree
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from jetbot_mjx.evaluation import learning_curves, plots
+from jetbot_mjx.evaluation import learning_curves, plots, return_plots
 from jetbot_mjx.evaluation.comparison import Comparison
 from jetbot_mjx.evaluation.moments import plot_moments, shown_goals
 from jetbot_mjx.evaluation.report import Report, replay_command
+from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
 from jetbot_mjx.runs import JsonObject, make_folder, write_bytes, write_json, write_text, writing_to
 
 LISTED_FAILURES = 50
@@ -29,8 +30,10 @@ _MAX_REPLAYED = 8
 _OPTIONAL_FIGURES = {
     "report": {"learning_curve", "robustness", "seen"},
     "comparison": {"learning_curves"},
+    "return_report": {"learning_curve"},
+    "return_comparison": {"learning_curves"},
 }
-"""Names of the figures that a page may lack."""
+"""Names of the figures that the page of a template may lack."""
 
 _PAGES = jinja2.Environment(
     loader=jinja2.PackageLoader("jetbot_mjx", "assets"),
@@ -108,11 +111,55 @@ def write_comparison(comparison: Comparison) -> Path:
     figures = {"runs": lambda: learning_curves.plot_runs(comparison)}
     if any(run.learning_curve for run in comparison.runs):
         figures["learning_curves"] = lambda: learning_curves.plot_learning_curves(comparison)
-    links = [
+    more = {"links": _links(comparison)}
+    return _write(comparison.folder, "comparison", comparison.to_json(), figures, more)
+
+
+def write_return_report(report: ReturnReport) -> Path:
+    """Write a report on a policy of an environment of one's own, as `write_report` does.
+
+    Args:
+      report: the report of one policy.
+
+    Returns:
+      The path of `report.html`.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    figures = {"returns": lambda: return_plots.plot_returns(report)}
+    if report.learning_curve:
+        figures["learning_curve"] = lambda: return_plots.plot_return_curve(report)
+    more = {"evaluate_command": report.evaluate_command()}
+    return _write(report.folder, "report", report.to_json(), figures, more, "return_report")
+
+
+def write_return_comparison(comparison: ReturnComparison) -> Path:
+    """Write a comparison of runs in one environment of one's own, as `write_comparison` does.
+
+    Args:
+      comparison: a comparison of runs whose own reports are already written.
+
+    Returns:
+      The path of `comparison.html`.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    figures = {"runs": lambda: return_plots.plot_return_runs(comparison)}
+    if any(run.learning_curve for run in comparison.runs):
+        figures["learning_curves"] = lambda: return_plots.plot_return_curves(comparison)
+    more = {"links": _links(comparison)}
+    values = comparison.to_json()
+    return _write(comparison.folder, "comparison", values, figures, more, "return_comparison")
+
+
+def _links(comparison: Comparison | ReturnComparison) -> list[list[str]]:
+    """Return the reports of each run's seeds, without the ends of their files' names."""
+    return [
         [os.path.relpath(one.folder / "report", comparison.folder) for one in run.seeds.values()]
         for run in comparison.runs
     ]
-    return _write(comparison.folder, "comparison", comparison.to_json(), figures, {"links": links})
 
 
 def _write(
@@ -121,15 +168,17 @@ def _write(
     values: JsonObject,
     figures: Mapping[str, Callable[[], Figure]],
     more: JsonObject,
+    template: str | None = None,
 ) -> Path:
     """Draw all figures and render all pages, then write the files, the HTML page last."""
+    template = template or name
     drawn = {figure: _draw(draw) for figure, draw in figures.items()}
     images = {
         figure: {"file": f"{figure}.png", **{name: _data_uri(png) for name, png in pngs.items()}}
         for figure, pngs in drawn.items()
     }
     pages = {
-        suffix: _PAGES.get_template(f"{name}{suffix}").render(
+        suffix: _PAGES.get_template(f"{template}{suffix}").render(
             values=values, figures=images, number=_numbers(values, suffix), **more
         )
         for suffix in (".md", ".html")
@@ -137,7 +186,7 @@ def _write(
     make_folder(folder)
     with writing_to(folder):
         # Remove figures of an earlier report that this one does not have.
-        for figure in sorted(_OPTIONAL_FIGURES[name] - drawn.keys()):
+        for figure in sorted(_OPTIONAL_FIGURES[template] - drawn.keys()):
             (folder / f"{figure}.png").unlink(missing_ok=True)
         for figure, pngs in drawn.items():
             write_bytes(folder / f"{figure}.png", pngs["light"])

@@ -83,8 +83,10 @@ def plot_runs(comparison: Comparison) -> Figure:
     success, seconds = figure.subplots(1, 2, sharey=True)
     for row, run in enumerate(comparison.runs):
         policies = [report.policy for report in run.seeds.values()]
-        _forest(success, row, run.success_rate, [one.success_rate for one in policies])
-        _forest(seconds, row, run.time_to_goal, [one.time_to_goal_median for one in policies])
+        plot_aggregate(success, row, run.success_rate, [one.success_rate for one in policies])
+        plot_aggregate(
+            seconds, row, run.time_to_goal, [one.time_to_goal_median for one in policies]
+        )
     success.set_yticks(range(len(comparison.runs)), [run.name for run in comparison.runs])
     success.set_ylim(len(comparison.runs) - 0.5, -0.6)
     success.xaxis.set_major_formatter(PercentFormatter(1.0))
@@ -97,8 +99,17 @@ def plot_runs(comparison: Comparison) -> Figure:
     return figure
 
 
-def _forest(axes: Axes, row: int, aggregate: Aggregate, values: Sequence[float | None]) -> None:
-    """Draw a run's seeds, its mean with interval, and below it the interquartile mean."""
+def plot_aggregate(
+    axes: Axes, row: int, aggregate: Aggregate, values: Sequence[float | None]
+) -> None:
+    """Draw a run's seeds, its mean with interval, and below it the interquartile mean.
+
+    Args:
+      axes: the axes to draw on.
+      row: the number of the run, from above.
+      aggregate: the quantity over its seeds or episodes.
+      values: the quantity of each seed.
+    """
     colour = f"C{row}"
     kinds = [(aggregate.mean, 0.0, "o"), (aggregate.iqm, 0.22, "s")]
     if aggregate.over == "seeds":

@@ -2,18 +2,26 @@
 
 from collections.abc import Mapping
 
+from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.bootstrap_intervals import Estimate
 from jetbot_mjx.evaluation.comparison import Comparison
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.report import Report
 from jetbot_mjx.evaluation.result_names import fuller_report
+from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
+from jetbot_mjx.evaluation.return_tables import (
+    summarize_return_comparison,
+    summarize_return_report,
+)
 from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, robust_range
 from jetbot_mjx.terminal import text_table
 
 
-def summarize_report(report: Report) -> str:
+def summarize_report(report: Report | ReturnReport) -> str:
     """Return the results of one policy."""
+    if isinstance(report, ReturnReport):
+        return summarize_return_report(report)
     text = (
         f"{_count(report.policy.episodes, 'fixed goal')} (set {GOAL_SET_VERSION}), policy after"
         f" {report.env_steps:,} steps\n{policies_table({'policy': report})}\n"
@@ -27,8 +35,10 @@ def summarize_report(report: Report) -> str:
     return text
 
 
-def summarize_comparison(comparison: Comparison) -> str:
+def summarize_comparison(comparison: Comparison | ReturnComparison) -> str:
     """Return the results of all policies of a comparison, and the differences between its runs."""
+    if isinstance(comparison, ReturnComparison):
+        return summarize_return_comparison(comparison)
     runs = comparison.runs
     policies = {
         seed if len(runs) == 1 else f"{run.name} {seed}" if len(run.seeds) > 1 else run.name: report
@@ -44,7 +54,9 @@ def summarize_comparison(comparison: Comparison) -> str:
     return f"{text}\nreport: {comparison.folder / 'comparison.html'}"
 
 
-def below_target(result: Report | Comparison, target: float) -> list[str]:
+def below_target(
+    result: Report | ReturnReport | Comparison | ReturnComparison, target: float
+) -> list[str]:
     """Return a line for every run whose success rate is below the target.
 
     Args:
@@ -53,17 +65,27 @@ def below_target(result: Report | Comparison, target: float) -> list[str]:
 
     Returns:
       The lines. They name the run where there are several.
+
+    Raises:
+      UserError: there is a target, and the environment has no metric `success`.
     """
-    rates: Mapping[str, float]
-    if isinstance(result, Report):
+    rates: Mapping[str, float | None]
+    if isinstance(result, Report | ReturnReport):
         rates = {"": result.policy.success_rate}
     else:
-        rates = {run.name: run.success_rate.mean.value or 0.0 for run in result.runs}
+        rates = {
+            run.name: run.success_rate and (run.success_rate.mean.value or 0.0)
+            for run in result.runs
+        }
+    if target > 0 and None in rates.values():
+        raise UserError(
+            f"--min-success {target:g}: the environment has no metric 'success': leave it out"
+        )
     prefix = "{}: " if len(rates) > 1 else ""
     return [
         f"{prefix.format(name)}success {rate:.2%} is below the {target:.2%} asked for"
         for name, rate in rates.items()
-        if rate < target
+        if rate is not None and rate < target
     ]
 
 

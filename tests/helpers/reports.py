@@ -8,7 +8,9 @@ from jetbot_mjx.config import parse_config
 from jetbot_mjx.evaluation.comparison import compare
 from jetbot_mjx.evaluation.evaluator import summarize
 from jetbot_mjx.evaluation.report import Report, by_goal, find_failures
-from jetbot_mjx.evaluation.rollout import Episodes
+from jetbot_mjx.evaluation.return_report import ReturnReport
+from jetbot_mjx.evaluation.returns import summarize_returns
+from jetbot_mjx.evaluation.rollout import Episodes, ReturnEpisodes
 
 CTRL_DT = 1 / 60
 
@@ -76,3 +78,30 @@ def comparison_of(**runs):
         name: {f"seed-{i}": one for i, one in enumerate(seeds)} for name, seeds in runs.items()
     }
     return compare(Path("somewhere"), named)
+
+
+def return_report_of(returns, run_dir="runs/a", curve=(), steps=10, **settings):
+    """A report of episodes in an environment of one's own, of which these are the returns."""
+    count = len(returns)
+    zeros = np.zeros(count, np.float32)
+    episodes = ReturnEpisodes(
+        success=zeros,
+        steps=np.full(count, steps, np.float32),
+        episode_return=np.asarray(returns, np.float32),
+        terminated=zeros,
+        nonfinite=zeros,
+        qpos=None,
+    )
+    return ReturnReport(
+        folder=Path(run_dir) / "evaluations" / "2048",
+        run=Path(run_dir),
+        checkpoint=Path(run_dir) / "checkpoints" / "000000002048",
+        env_steps=2048,
+        config=parse_config({"environment": "hopper:Hopper", **settings}),
+        dt=None,
+        policy=summarize_returns(episodes, has_success=False),
+        baselines={},
+        learning_curve=tuple(curve),
+        episodes=episodes,
+        versions={},
+    )

@@ -1,0 +1,76 @@
+"""Format the returns of policies as tables and lines for the terminal."""
+
+from collections.abc import Mapping
+
+from jetbot_mjx.evaluation.bootstrap_intervals import Estimate
+from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
+from jetbot_mjx.evaluation.returns import ReturnSummary
+from jetbot_mjx.terminal import text_table
+
+
+def summarize_return_report(report: ReturnReport) -> str:
+    """Return the results of one policy."""
+    policy = report.policy
+    text = (
+        f"{policy.episodes:,} fixed starts, policy after {report.env_steps:,} steps\n"
+        f"{_policies_table({'policy': policy, **report.baselines})}\n"
+        f"report: {report.folder / 'report.html'}"
+    )
+    if policy.nonfinite_envs:
+        text += f"\n{policy.nonfinite_envs:,} episodes ended in a non-finite state"
+    return text
+
+
+def summarize_return_comparison(comparison: ReturnComparison) -> str:
+    """Return the results of all policies of a comparison, and the differences between its runs."""
+    runs = comparison.runs
+    policies = {
+        f"{run.name} {seed}" if len(run.seeds) > 1 else run.name: report.policy
+        for run in runs
+        for seed, report in run.seeds.items()
+    }
+    rows = [("", "return, mean", "interquartile mean", "success, mean", "95 % intervals over")]
+    for run in runs:
+        found = run.episode_return
+        success = _estimate(run.success_rate.mean, "{:.2%}") if run.success_rate else "-"
+        over = f"{found.count:,} {found.over}"
+        both = _estimate(found.mean, "{:.2f}"), _estimate(found.iqm, "{:.2f}")
+        rows.append((run.name, *both, success, over))
+    lines = [
+        f"{comparison.episodes:,} fixed starts, {len(policies)} policies",
+        _policies_table({**policies, **comparison.baselines}),
+        f"\n{text_table(rows)}\n",
+    ]
+    for pair in comparison.pairs:
+        result = pair.episode_return
+        lines.append(
+            f"{pair.a} against {pair.b}: difference {_estimate(result.difference, '{:+.2f}')},"
+            f" improvement {_estimate(result.improvement, '{:.0%}')},"
+            f" starts {result.wins} : {result.losses} (p {result.p:.2g})"
+        )
+    return "\n".join([*lines, f"report: {comparison.folder / 'comparison.html'}"])
+
+
+def _policies_table(policies: Mapping[str, ReturnSummary]) -> str:
+    rows = [("", "return", "95 % interval", "lowest", "length", "success")]
+    rows += [
+        (
+            name,
+            f"{one.episode_return:.2f}",
+            f"{one.return_low:.2f} .. {one.return_high:.2f}",
+            f"{one.return_min:.2f}",
+            f"{one.episode_length:.1f}",
+            "-" if one.success_rate is None else f"{one.success_rate:.2%}",
+        )
+        for name, one in policies.items()
+    ]
+    return text_table(rows)
+
+
+def _estimate(estimate: Estimate, form: str) -> str:
+    if estimate.value is None:
+        return "-"
+    text = form.format(estimate.value)
+    if estimate.low is None or estimate.high is None:
+        return text
+    return f"{text} ({form.format(estimate.low)} .. {form.format(estimate.high)})"

@@ -1,0 +1,52 @@
+"""The figures about returns show the numbers of the reports."""
+
+from pathlib import Path
+
+import numpy as np
+
+from helpers.reports import return_report_of
+from jetbot_mjx.evaluation.return_plots import (
+    plot_return_curve,
+    plot_return_curves,
+    plot_return_runs,
+    plot_returns,
+)
+from jetbot_mjx.evaluation.return_report import ReturnPoint, compare_returns
+
+CURVE = ReturnPoint(0, 1.0, 0.5, 1.5), ReturnPoint(2048, 3.0, 2.0, 4.0)
+
+
+def test_histograms_hold_every_episode_by_how_it_ended():
+    report = return_report_of([1.0, 2.0, 2.0, 7.0])
+    ended = np.array([0, 0, 0, 1], np.float32)
+    report = report._replace(episodes=report.episodes._replace(terminated=ended))
+    left, right = plot_returns(report).axes
+    for axes in (left, right):
+        by_end = [sum(patch.get_height() for patch in bars) for bars in axes.containers]
+        assert by_end == [3, 1]
+    assert left.lines[0].get_xdata()[0] == report.policy.episode_return
+
+
+def test_a_curve_shows_the_training_the_report_and_the_baselines():
+    report = return_report_of([1.0, 2.0], curve=CURVE)
+    report = report._replace(baselines={"zero": report.policy._replace(episode_return=-1.0)})
+    (axes,) = plot_return_curve(report).axes
+    assert list(axes.lines[0].get_ydata()) == [1.0, 3.0]
+    assert axes.lines[1].get_xydata().tolist() == [[2048, 1.5]]
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels == ["during the training, its own starts", "this report", "zero"]
+
+
+def test_a_comparison_draws_every_run_once():
+    seeds = {f"seed-{i}": return_report_of([1.0 + i], curve=CURVE) for i in range(2)}
+    comparison = compare_returns(Path("there"), {"a": seeds, "b": {"seed-0": seeds["seed-1"]}})
+    (axes,) = plot_return_curves(comparison).axes
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels == ["a, 2 seeds", "b"]
+    (returns,) = plot_return_runs(comparison).axes
+    assert [text.get_text() for text in returns.get_yticklabels()] == ["a", "b"]
+    success = comparison.runs[0].episode_return
+    told = comparison._replace(
+        runs=tuple(x._replace(success_rate=success) for x in comparison.runs)
+    )
+    assert len(plot_return_runs(told).axes) == 2
