@@ -37,6 +37,7 @@ from .mujoco_simulator import Numerics as Numerics
 from .mujoco_simulator import in_mujoco as in_mujoco
 from .opengl import SceneRenderer as SceneRenderer
 from .opengl import find_backend as find_backend
+from .own_class import import_class as import_class
 from .program_key import is_built_in as is_built_in
 from .program_key import open_program_cache as open_program_cache
 from .program_key import own_fingerprint as own_fingerprint

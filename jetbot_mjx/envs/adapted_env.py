@@ -73,6 +73,10 @@ class AdaptedEnv(Env):
         options = config.environment_options
         self.source: Any = self._told(found.__name__, lambda: found(**options))
         """The environment itself."""
+        if jax.config.values["jax_enable_x64"]:
+            raise InvalidError(
+                f"environment = {name!r} sets jax_enable_x64: leave it out, numbers are float32"
+            )
         one = self._told("it", lambda: as_foreign(self.source))
         kind = config.ppo.network.distribution_type
         if one.is_discrete != (kind == "categorical"):
@@ -291,7 +295,18 @@ class _Traced:
 
 
 def _make_jaxpr(function: Callable[..., Outcome], *like: PyTree) -> tuple[ClosedJaxpr, Outcome]:
-    return jax.make_jaxpr(function, return_shape=True)(*like)
+    """Trace a function; return also what its results are like.
+
+    Raises:
+      InvalidError: it uses what an earlier call has left behind.
+    """
+    traced, results = jax.make_jaxpr(function, return_shape=True)(*like)
+    if any(isinstance(x, jax.core.Tracer) for x in traced.consts):
+        raise InvalidError(
+            f"{function.__name__} uses a value that an earlier call kept in self: keep what changes"
+            " in the state"
+        )
+    return traced, results
 
 
 def _read_leaves(step: ClosedJaxpr, count: int) -> list[bool]:

@@ -153,6 +153,7 @@ def execute(page, words, reader, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Brax System", "ignore:Accessing")
 @pytest.mark.parametrize(("page", "words"), of_kind("python", "-m", "jetbot_mjx.train"))
 def test_a_documented_training_trains(page, words, reader, monkeypatch, capsys):
     if "wandb=jetbots" in words:
@@ -335,7 +336,7 @@ def test_documented_tasks_are_written_and_checked(tmp_path):
         for name in ("new_task", "new_env", "check_env", "new_robot", "check_robot")
         for one in of_kind("python", "-m", f"jetbot_mjx.{name}")
     ]
-    assert len(found) == 4
+    assert len(found) == 6
     for page, words in found:
         folder = tmp_path / page
         folder.mkdir(exist_ok=True)
@@ -345,9 +346,10 @@ def test_documented_tasks_are_written_and_checked(tmp_path):
         name = words[start].removeprefix("jetbot_mjx.")
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(folder)
-            if name == "new_robot":
-                # The page shows a shorter one of this name.
-                Path(words[start + 1]).unlink()
+            if name in ("new_robot", "new_env"):
+                # The page shows a file of this name, too.
+                for file in own_files(page).keys() & {words[start + 1], "my_env.yaml"}:
+                    Path(file).unlink()
             assert run(name, words[start + 1 :]) == 0, words
 
 

@@ -8,22 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from helpers.own_environments import ZERO, Point
-from jetbot_mjx import State
 
 count = itertools.count(1)
 
 
 class TurnsOnFloat64(Point):
     def __init__(self):
+        super().__init__()
         jax.config.update("jax_enable_x64", True)
-
-
-class StepsInFloat64(Point):
-    def step(self, state, action):
-        with jax.enable_x64(True):
-            x = state.pipeline_state["x"].astype(jnp.float64)
-            after = super().step(state, action)
-            return after.replace(pipeline_state=after.pipeline_state | {"x": x})
 
 
 class DecidesInPython(Point):
@@ -97,12 +89,14 @@ class RemembersItsState(Point):
 
 class DrawsFromNumpy(Point):
     def step(self, state, action):
-        return super().step(state, action + np.random.normal())
+        return super().step(state, action + np.random.default_rng().normal())
 
 
 class DrawsAResetFromNumpy(Point):
     def reset(self, rng):
-        return self.state(jnp.float32(np.random.uniform()), jnp.zeros(()), {"speed": ZERO})
+        return self.state(
+            jnp.float32(np.random.default_rng().uniform()), jnp.zeros(()), {"speed": ZERO}
+        )
 
 
 class NamesAMetricAnewEachTime(Point):
@@ -113,8 +107,7 @@ class NamesAMetricAnewEachTime(Point):
 class ResetsSlowly(Point):
     def reset(self, rng):
         first = super().reset(rng)
-        # An instance after the other, as XLA steps what only its last number ends.
-        x = jax.lax.fori_loop(0, 40_000_000, lambda i, x: jnp.sin(x + 0.1), first.obs[0])
+        x = jax.lax.fori_loop(0, 30_000_000, lambda i, x: jnp.sin(x + 0.1), first.obs[0])
         return first.replace(obs=first.obs.at[0].set(x))
 
 
@@ -241,9 +234,32 @@ class OfGymnasium:
         return np.zeros(3, np.float32), 0.0, False, False, {}
 
 
-def sound():
+class IsRarelyNotFinite(Point):
+    """Its reward has no end in the one step of a thousand that is its instance's 64th."""
+
+    def reset(self, rng):
+        first = super().reset(rng)
+        inside = first.pipeline_state | {"t": jnp.zeros((), jnp.int32), "odds": rng[1] % 4}
+        return first.replace(pipeline_state=inside)
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        inside = state.pipeline_state
+        t, odds = inside["t"] + 1, inside["odds"]
+        lost = (t == 64) & (odds == 0)
+        return after.replace(
+            pipeline_state=after.pipeline_state | {"t": t, "odds": odds},
+            reward=jnp.where(lost, jnp.inf, after.reward),
+        )
+
+
+class Sorts(Point):
+    """What one kernel cannot do is no mistake."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return after.replace(reward=after.reward + jnp.linalg.eigh(jnp.diag(after.obs))[0][0])
+
+
+class Sound(Point):
     """Nothing is wrong with this one."""
-    return Point()
-
-
-__all__ = ["State"]
