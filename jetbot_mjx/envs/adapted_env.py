@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 from flax import struct
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import partial_eval
 from jaxtyping import Array, Float, PyTree, UInt32
@@ -301,7 +302,7 @@ def _make_jaxpr(function: Callable[..., Outcome], *like: PyTree) -> tuple[Closed
       InvalidError: it uses what an earlier call has left behind.
     """
     traced, results = jax.make_jaxpr(function, return_shape=True)(*like)
-    if any(isinstance(x, jax.core.Tracer) for x in traced.consts):
+    if any(isinstance(x, Tracer) for x in traced.consts):
         raise InvalidError(
             f"{function.__name__} uses a value that an earlier call kept in self: keep what changes"
             " in the state"

@@ -131,7 +131,8 @@ def _faults(env: AdaptedEnv, rare: float = _RARE) -> Iterator[str]:
 
 
 def _compiled(traced: jax.stages.Traced) -> jax.stages.Compiled:
-    return traced.lower().compile(_QUICKLY if jax.default_backend() == "cpu" else None)
+    options: Any = _QUICKLY if jax.default_backend() == "cpu" else None
+    return traced.lower().compile(options)
 
 
 def _drive(env: AdaptedEnv, first: State) -> dict[str, Array]:
