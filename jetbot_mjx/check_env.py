@@ -1,64 +1,132 @@
-"""Check a task before it is trained: `jetbot-mjx check-env my_task:MyTask`.
+"""Check a task or an environment before it is trained: `jetbot-mjx check-env my_env.yaml`.
 
-Every mistake is reported in one line that says how to correct it. A built-in task is named by its
-class alone, such as `GoalTask`. `--config my_task.yaml` checks a task with the settings of a run.
+Every mistake is reported in one line that says how to correct it. Name a configuration, a class as
+`package.module:Class`, or a built-in task by its class alone, such as `GoalTask`. `--config` checks
+a class with the settings of a run. Of an environment of your own, sizes and costs are told, too.
 """
 
-from collections.abc import Sequence
+import argparse
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 from jetbot_mjx import cli, startup
+from jetbot_mjx.config import YAML_ENDINGS, Config, shipped_configs
+from jetbot_mjx.fallbacks import collect
 
 BROKEN = 1
-"""Exit code for a task that has an error."""
+"""Exit code for a task or an environment that has an error."""
 
 _BUILT_IN = "jetbot_mjx"
 
+_INSTANCES = 1024
+"""Instances of the rate."""
+
+_INSTANCES_WITHOUT_KERNEL = 16
+"""Those of an environment whose step is no kernel: of many, it could take minutes."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line and check the task.
+    """Parse the command line and check the task or the environment.
 
     Args:
       arguments: The arguments without the program's name, or None for those of the process.
 
     Returns:
-      0, or 1 if the task has an error.
+      0, or 1 if there is an error.
     """
-    # Parse.
     parser = cli.Parser(prog="jetbot-mjx check-env", description=__doc__)
     parser.add_argument(
-        "task",
+        "what",
         nargs="?",
-        metavar="package.module:Class",
-        help="the task (default: the task of --config)",
+        metavar="CONFIG|package.module:Class",
+        help="a configuration, a task or an environment (default: that of --config)",
     )
     cli.add_config_arguments(parser, positional=False)
     options = parser.parse_args(arguments)
-    if not options.task and options.config is None:
-        parser.error("give a task as package.module:Class, or a --config that names one")
-    if (options.task or "").endswith((".yaml", ".yml")):
-        parser.error(f"{options.task} is a YAML file: did you mean --config {options.task}?")
-    if (options.task or "").endswith(".py"):
-        module = options.task.removesuffix(".py").replace("/", ".")
-        parser.error(f"{options.task} is a file: name its class too, as {module}:Class")
-    name = options.task if ":" in (options.task or "") else f"{_BUILT_IN}:{options.task}"
-    config = cli.config_of(options, *([f"task.name={name}"] if options.task else []))
+    if not options.what and options.config is None:
+        parser.error("give a configuration, or a class as package.module:Class")
+    if (options.what or "").endswith(".py"):
+        module = options.what.removesuffix(".py").replace("/", ".")
+        parser.error(f"{options.what} is a file: name its class too, as {module}:Class")
     with startup.exit_on_interrupt():
-        from jetbot_mjx.envs import CHECKS, check_task
+        from jetbot_mjx import envs
+    config = _config(options)
     cli.prepare_device()
-    # Check, and print each result as soon as it is known.
-    errors, remaining = 0, list(CHECKS)
-    for name, findings in check_task(config):
+    if config.environment is None:
+        about = {name: text for name, (_, text) in envs.CHECKS.items()}
+        return _tell(config, about, envs.check_task(config))
+    code = _tell(config, envs.ENVIRONMENT_CHECKS, envs.check_environment(config))
+    if code == 0:
+        _tell_cost(envs.make_env(config))
+    return code
+
+
+def _config(options: argparse.Namespace) -> Config:
+    """Return the configuration to check."""
+    what = options.what
+    if not what:
+        return cli.config_of(options)
+    if options.config is None and (what.endswith(YAML_ENDINGS) or what in shipped_configs()):
+        options.config = Path(what)
+        return cli.config_of(options)
+    if _is_environment(what):
+        return cli.config_of(options, f"environment={what}")
+    name = what if ":" in what else f"{_BUILT_IN}:{what}"
+    return cli.config_of(options, f"task.name={name}")
+
+
+def _is_environment(name: str) -> bool:
+    """Return whether a class has the methods of an environment, which those of a task are not."""
+    from jetbot_mjx.envs import import_class
+
+    return ":" in name and hasattr(import_class("environment", name), "step")
+
+
+def _tell(
+    config: Config, about: Mapping[str, str], checked: Iterable[tuple[str, list[str]]]
+) -> int:
+    """Print each result as soon as it is known, and return the exit code."""
+    errors, remaining = 0, list(about)
+    for name, findings in checked:
         errors += len(findings)
         remaining.remove(name)
-        cli.tell(f"{'wrong' if findings else 'ok':5}  {name:8}  {CHECKS[name][1]}")
+        cli.tell(f"{'wrong' if findings else 'ok':5}  {name:9}  {about[name]}")
         for finding in findings:
             cli.tell(f"{'':7}- {finding}")
-    # Summarise.
     if errors and remaining:
         cli.tell(f"not checked until that is corrected: {', '.join(remaining)}")
     total = f"{errors} error{'s' * (errors > 1)}" if errors else "no errors"
-    cli.tell(f"{config.task.name}: {total}")
+    cli.tell(f"{config.code}: {total}")
     return BROKEN if errors else 0
+
+
+def _tell_cost(env: Any) -> None:
+    """Print sizes of an environment of one's own, what its step is as a kernel, and the rate."""
+    import jax
+    import jax.numpy as jnp
+
+    import onekernel
+    from jetbot_mjx.envs import step_rate
+
+    kind = "choices" if env.is_discrete else f"action{'s' * (env.action_size > 1)}"
+    cli.tell(f"{'sizes':10} {env.observation_size} observations, {env.action_size} {kind}")
+    cli.tell(f"{'metrics':10} {', '.join(env.metrics) or 'none'}")
+    state = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), jnp.uint32))
+    kept = jax.tree.leaves(state.pipeline_state)
+    cli.tell(f"{'state':10} {sum(x.size for x in kept)} numbers that a later step reads")
+    arguments = state, jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
+    one = onekernel.fuse(env.step, on_unsupported="xla")
+    onekernel.explain(one, *arguments)
+    is_kernel = isinstance(one.lowered(*arguments).one, onekernel.Kernel) and env.may_be_kernel
+    instances = _INSTANCES if is_kernel else _INSTANCES_WITHOUT_KERNEL
+    # The reason why there is no kernel was told above.
+    with collect():
+        rate = step_rate(env, instances)
+    device = jax.devices()[0].device_kind
+    cli.tell(
+        f"{'rate':10} {rate:,.2g} environment steps/s of {instances:,} instances on this {device}"
+    )
 
 
 if __name__ == "__main__":

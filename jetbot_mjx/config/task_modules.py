@@ -32,7 +32,8 @@ def class_name(value: object) -> object:
         return f"{module}:{name}"
     # Python itself separates a class from its module by a dot.
     likely = ":".join(value.rpartition(".")[::2])
-    hint = f", perhaps {likely}" if not separator and likely[0] not in ".:" else ""
+    is_likely = not separator and likely[0] not in ".:" and not value.endswith(".py")
+    hint = f", perhaps {likely}" if is_likely else ""
     raise ValueError(
         f"{shown(value)} is wrong: write file.py:Class, with a file beside the configuration, or"
         f" package.module:Class{hint}"

@@ -9,6 +9,9 @@ from .camera.wrapper import NUMBERS as NUMBERS
 from .camera.wrapper import PIXELS as PIXELS
 from .camera.wrapper import see as see
 from .camera.wrapper import with_camera as with_camera
+from .checks.own_environment import ENVIRONMENT_CHECKS as ENVIRONMENT_CHECKS
+from .checks.own_environment import check_environment as check_environment
+from .checks.own_environment import require_sound as require_sound
 from .checks.runner import CHECKS as CHECKS
 from .checks.runner import check_task as check_task
 from .checks.runner import require_trainable as require_trainable
@@ -34,6 +37,7 @@ from .mujoco_simulator import Numerics as Numerics
 from .mujoco_simulator import in_mujoco as in_mujoco
 from .opengl import SceneRenderer as SceneRenderer
 from .opengl import find_backend as find_backend
+from .own_class import import_class as import_class
 from .program_key import is_built_in as is_built_in
 from .program_key import open_program_cache as open_program_cache
 from .program_key import own_fingerprint as own_fingerprint
@@ -59,6 +63,7 @@ from .task import RobotState as RobotState
 from .task import Task as Task
 from .task import layout_data as layout_data
 from .task import layout_table as layout_table
+from .task_template import write_environment_template as write_environment_template
 from .task_template import write_task_template as write_task_template
 from .versions import LIBRARIES as LIBRARIES
 from .versions import installed_version as installed_version

@@ -22,6 +22,7 @@ from jax.interpreters import partial_eval
 from jaxtyping import Array, Float, PyTree, UInt32
 
 from jetbot_mjx.config import Config
+from jetbot_mjx.devices import default_device_cpu
 from jetbot_mjx.envs.checks.probe import changed_leaf, describe_error
 from jetbot_mjx.envs.foreign import SUCCESS, Foreign, Outcome, as_foreign
 from jetbot_mjx.envs.kernel_impl import KernelImpl
@@ -72,6 +73,10 @@ class AdaptedEnv(Env):
         options = config.environment_options
         self.source: Any = self._told(found.__name__, lambda: found(**options))
         """The environment itself."""
+        if jax.config.values["jax_enable_x64"]:
+            raise InvalidError(
+                f"environment = {name!r} sets jax_enable_x64: leave it out, numbers are float32"
+            )
         one = self._told("it", lambda: as_foreign(self.source))
         kind = config.ppo.network.distribution_type
         if one.is_discrete != (kind == "categorical"):
@@ -95,7 +100,10 @@ class AdaptedEnv(Env):
     def _told(self, who: str, call: Callable[[], Any]) -> Any:
         """Call code of the user, and tell its exceptions in one line."""
         try:
-            return call()
+            # Each operation outside of what is traced is a program of its own, which a GPU compiles
+            # for longer.
+            with default_device_cpu():
+                return call()
         except UserError as error:
             raise InvalidError(f"environment = {self.config.environment!r}: {error}") from None
         except Exception as error:
@@ -112,7 +120,7 @@ class AdaptedEnv(Env):
 
         def reset(rng: Array) -> Outcome:
             outcome = one.reset(rng)
-            kinds.append(jax.tree.map(jax.typeof, jax.tree.map(jnp.asarray, outcome.kept)))
+            kinds.append(jax.tree.map(_kind, outcome.kept))
             return _with_words(outcome)
 
         def step(words: PyTree, action: Array) -> Outcome:
@@ -123,8 +131,9 @@ class AdaptedEnv(Env):
         step_jaxpr, following = self._told("step", lambda: _make_jaxpr(step, first.kept, action))
         if unlike := changed_leaf(first, following):
             raise InvalidError(
-                f"environment = {self.config.environment!r}: a step changes the state's {unlike}:"
-                " keep names, tree, shapes and dtypes as reset has them"
+                f"environment = {self.config.environment!r}: a step changes the state's"
+                f" {unlike.removeprefix('kept.')}: keep names, tree, shapes and dtypes as reset has"
+                " them"
             )
         # Of what is kept, only some is read; of the rest of an outcome, all is.
         paths = jax.tree_util.tree_leaves_with_path(first.kept)
@@ -286,7 +295,18 @@ class _Traced:
 
 
 def _make_jaxpr(function: Callable[..., Outcome], *like: PyTree) -> tuple[ClosedJaxpr, Outcome]:
-    return jax.make_jaxpr(function, return_shape=True)(*like)
+    """Trace a function; return also what its results are like.
+
+    Raises:
+      InvalidError: it uses what an earlier call has left behind.
+    """
+    traced, results = jax.make_jaxpr(function, return_shape=True)(*like)
+    if any(isinstance(x, jax.core.Tracer) for x in traced.consts):
+        raise InvalidError(
+            f"{function.__name__} uses a value that an earlier call kept in self: keep what changes"
+            " in the state"
+        )
+    return traced, results
 
 
 def _read_leaves(step: ClosedJaxpr, count: int) -> list[bool]:
@@ -317,11 +337,14 @@ def _as_words(x: Any) -> Array:
     return jax.random.key_data(array) if _is_key(array.dtype) else array.astype(array.dtype)
 
 
+def _kind(x: Any) -> Any:
+    """Return the implementation of random keys, or "" for numbers."""
+    return jax.random.key_impl(x) if _is_key(jnp.asarray(x).dtype) else ""
+
+
 def _from_words(kind: Any, words: Array) -> Array:
     """Return an array of a kind; the inverse of `_as_words`."""
-    if not _is_key(kind.dtype):
-        return words
-    return jax.random.wrap_key_data(words, impl=jax.random.key_impl(kind))
+    return words if kind == "" else jax.random.wrap_key_data(words, impl=kind)
 
 
 def _is_key(dtype: Any) -> bool:

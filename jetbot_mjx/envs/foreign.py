@@ -62,6 +62,12 @@ def as_foreign(source: Any) -> Foreign:
     params = source[1] if isinstance(source, tuple) else None
     if callable(getattr(env, "step_env", None)) and callable(getattr(env, "reset_env", None)):
         return _gymnax(env, env.default_params if params is None else params)
+    modules = {one.__module__.partition(".")[0] for one in type(env).__mro__}
+    if modules & {"gymnasium", "gym"}:
+        raise InvalidError(
+            f"{type(env).__name__} is Gymnasium's and runs in Python: write reset and step in JAX,"
+            " as the page on own environments says"
+        )
     lacks = [name for name in ("reset", "step") if not callable(getattr(source, name, None))]
     if lacks:
         raise InvalidError(
@@ -72,6 +78,9 @@ def as_foreign(source: Any) -> Foreign:
 
 def _brax(env: Any) -> Foreign:
     def outcome(state: Any) -> Outcome:
+        if state is None or type(state) in (tuple, list):
+            what = "nothing" if state is None else f"a {type(state).__name__}"
+            raise InvalidError(f"it returns {what}: return a state with obs, reward and done")
         lacks = [x for x in ("obs", "reward", "done") if not hasattr(state, x)]
         if lacks:
             raise InvalidError(f"its state lacks {', '.join(lacks)}")

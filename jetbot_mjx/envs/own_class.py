@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jetbot_mjx.config import find_task_here
-from jetbot_mjx.errors import InvalidError, MissingPackageError
+from jetbot_mjx.errors import InvalidError, MissingPackageError, UserError
 
 
 def import_class(key: str, name: str) -> Any:
@@ -50,6 +50,14 @@ def import_class(key: str, name: str) -> Any:
             f"{key} = {name!r}: {error.filename}, line {error.lineno}, is not valid Python:"
             f" {error.msg}"
         ) from None
+    except UserError:
+        raise
+    except Exception as error:
+        # Only a mistake needs it.
+        from jetbot_mjx.envs.checks.probe import describe_error
+
+        described = describe_error(error, f"the import of {module_name}", ())
+        raise InvalidError(f"{key} = {name!r}: {described}") from error
     found, owner = module, module_name
     for part in class_name.split("."):
         if not hasattr(found, part):

@@ -11,11 +11,13 @@ import mujoco
 import numpy as np
 
 from jetbot_mjx.config import MjcfRobotConfig, RobotConfig
+from jetbot_mjx.envs.adapted_env import AdaptedEnv
 from jetbot_mjx.envs.drive import AckermannDrive, OwnDrive
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mjcf_robot import PREFIX
 from jetbot_mjx.envs.robot_trial import Trial, drive_trial, trial_turn
 from jetbot_mjx.envs.task import reach_on_floor
+from jetbot_mjx.envs.wrappers import wrap_for_training
 
 _STEPS = 64
 """Steps of a call whose rate is measured."""
@@ -184,24 +186,28 @@ def _may_touch(model: mujoco.MjModel, one: int, other: int) -> bool:
     return meets and bodies[0] != bodies[1] and not related
 
 
-def step_rate(env: JetBotEnv, robots: int) -> float:
-    """Return the environment steps per second of many robots on JAX's default device.
+def step_rate(env: JetBotEnv | AdaptedEnv, instances: int) -> float:
+    """Return the environment steps per second of many instances on JAX's default device.
 
     Args:
-      env: one environment, unwrapped; its images are left out.
-      robots: the number of robots.
+      env: one environment, unwrapped. The images of a robot are left out; an environment of one's
+        own is in the wrappers of a training.
+      instances: the number of instances.
     """
-    one = env.blind()
-    keys = jax.random.split(jax.random.PRNGKey(0), robots)
-    states = jax.jit(jax.vmap(one.reset))(keys)
-    actions = jax.random.uniform(keys[0], (robots, env.action_size), minval=-1.0)
+    if isinstance(env, AdaptedEnv):
+        batch = wrap_for_training(env, env.config.task.episode_length)
+        reset, step = batch.reset, batch.step
+    else:
+        reset, step = jax.vmap(env.blind().reset), jax.vmap(env.blind().step)
+    keys = jax.random.split(jax.random.PRNGKey(0), instances)
+    states = jax.jit(reset)(keys)
+    actions = jax.random.uniform(keys[0], (instances, env.action_size), minval=-1.0)
 
     @jax.jit
     def drive(states: Any) -> Any:
-        step = jax.vmap(one.step)
         return jax.lax.fori_loop(0, _STEPS, lambda _, x: step(x, actions), states)
 
     jax.block_until_ready(drive(states))
     begin = time.perf_counter()
     jax.block_until_ready(drive(states))
-    return robots * _STEPS / (time.perf_counter() - begin)
+    return instances * _STEPS / (time.perf_counter() - begin)

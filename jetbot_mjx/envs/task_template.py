@@ -1,4 +1,4 @@
-"""Write a copy of the obstacle example, as a task to start from."""
+"""Write a task or an environment to start from: a copy of an example under another name."""
 
 import importlib.util
 import keyword
@@ -6,9 +6,6 @@ from pathlib import Path
 
 from jetbot_mjx.config import shipped_folder
 from jetbot_mjx.errors import UserError
-
-_EXAMPLE = ("obstacle_task.py", "obstacle.yaml")
-"""The files that are copied."""
 
 
 def write_task_template(path: Path) -> Path:
@@ -24,27 +21,55 @@ def write_task_template(path: Path) -> Path:
     Raises:
       UserError: the name is not valid or belongs to another module, or a file exists already.
     """
+    return _write(path, shipped_folder("examples") / "obstacle_task.py", "obstacle")
+
+
+def write_environment_template(path: Path) -> Path:
+    """Write an environment and its settings, as `write_task_template` does a task.
+
+    Args:
+      path: as for `write_task_template`.
+
+    Returns:
+      The path of the settings.
+
+    Raises:
+      UserError: as for `write_task_template`.
+    """
+    return _write(path, Path(__file__).parents[1] / "assets" / "point_env.py", "point_env")
+
+
+def _write(path: Path, example: Path, settings: str) -> Path:
+    """Write a copy of an example.
+
+    Args:
+      path: the path of the module.
+      example: the module to copy, which has a class of its name.
+      settings: the name of its settings, which are beside it.
+    """
     # Check that the module can be imported by its name, and that nothing is overwritten.
     name = path.stem
     if path.suffix != ".py" or not name.isidentifier() or keyword.iskeyword(name):
-        raise UserError(f"{path}: name a Python module, such as my_task.py")
+        kind = example.stem.rpartition("_")[2]
+        raise UserError(f"{path}: name a Python module, such as my_{kind}.py")
     config = path.with_suffix(".yaml")
-    files = path, config
-    for file in files:
+    copies = {path: example, config: example.with_name(f"{settings}.yaml")}
+    for file in copies:
         if file.exists():
             raise UserError(f"{file} exists already: choose another name")
     if importlib.util.find_spec(name) is not None:
         raise UserError(f"{path}: a module {name} exists already: choose another name")
     # Copy the example under the new names.
     renamed = {
-        "jetbot-mjx train obstacle": f"jetbot-mjx train {config.name}",
-        "obstacle_task": name,
-        "ObstacleTask": "".join(word[:1].upper() + word[1:] for word in name.split("_")),
+        f"jetbot-mjx train {settings}\n": f"jetbot-mjx train {config.name}\n",
+        f"{settings}.yaml": config.name,
+        example.stem: name,
+        _class_name(example.stem): _class_name(name),
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for file, example in zip(files, _EXAMPLE, strict=True):
-            text = (shipped_folder("examples") / example).read_text("utf-8")
+        for file, source in copies.items():
+            text = source.read_text("utf-8")
             for old, new in renamed.items():
                 text = text.replace(old, new)
             # Mode "x" does not overwrite a file that was created in the meantime.
@@ -53,3 +78,7 @@ def write_task_template(path: Path) -> Path:
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None
     return config
+
+
+def _class_name(module: str) -> str:
+    return "".join(word[:1].upper() + word[1:] for word in module.split("_"))

@@ -117,6 +117,10 @@ class ProgramCache:
             pool.shutdown(wait=False)
         self.loads = all(self._path(name).exists() for name in names)
 
+    def has(self, name: str) -> bool:
+        """Return whether there is a file of a program, which need not be usable."""
+        return self._folder is not None and self._path(name).exists()
+
     def find(self, name: str) -> jax.stages.Compiled | None:
         """Return a program if it was compiled before.
 

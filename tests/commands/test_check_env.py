@@ -1,5 +1,7 @@
 """The command `check_env`: its output, its exit codes and its answers to mistakes."""
 
+import re
+
 import pytest
 
 from helpers import gliding
@@ -38,6 +40,64 @@ def test_a_configuration_names_its_task(root, monkeypatch):
     assert (asked[0].name, asked[0].episode_length) == ("gates_task:GatesTask", 360)
 
 
+OWN = "helpers.broken_environments"
+
+
+def test_a_sound_environment_is_clean_and_its_costs_are_told(capsys):
+    assert check_env.main([f"{OWN}:Sound", "--set", "task.episode_length=8"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[:16] for line in lines[:3]] == [
+        "ok     interface",
+        "ok     purity   ",
+        "ok     drive    ",
+    ]
+    assert lines[3:8] == [
+        f"{OWN}:Sound: no errors",
+        "sizes      2 observations, 1 action",
+        "metrics    speed",
+        "state      3 numbers that a later step reads",
+        "step is one kernel",
+    ]
+    assert re.fullmatch(r"rate       \S+ environment steps/s of 1,024 instances on .*", lines[-1])
+
+
+def test_an_environment_that_is_no_kernel_is_told_why(capsys):
+    assert check_env.main([f"{OWN}:Sorts"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[7].startswith("step is no kernel: one kernel cannot do ")
+    assert "of 16 instances" in lines[-1]
+
+
+def test_a_finding_about_an_environment_gives_exit_code_1(capsys):
+    assert check_env.main([f"{OWN}:HasNoReset"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("wrong  interface  ")
+    assert lines[1].endswith("HasNoReset is no environment: it lacks reset")
+    assert lines[2:] == [
+        "not checked until that is corrected: purity, drive",
+        f"{OWN}:HasNoReset: 1 error",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["cartpole"], "cartpole:Cartpole"),
+        (["{examples}/cartpole.yaml"], "cartpole:Cartpole"),
+        (["--config", "cartpole"], "cartpole:Cartpole"),
+        (["--config", "cartpole", f"{OWN}:Sound"], f"{OWN}:Sound"),
+        (["gates"], "gates_task:GatesTask"),
+    ],
+)
+def test_what_is_checked_has_a_name_or_a_file(root, monkeypatch, arguments, code):
+    asked = []
+    for name in ("check_task", "check_environment"):
+        monkeypatch.setattr(envs, name, lambda x: asked.append(x) or [("purity", ["wrong"])])
+    words = [word.replace("{examples}", str(root / "examples")) for word in arguments]
+    assert check_env.main(words) == 1
+    assert asked[0].code == code
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -57,7 +117,7 @@ def test_a_command_that_names_nothing_is_refused(capsys):
     with pytest.raises(SystemExit) as left:
         check_env.main([])
     assert left.value.code == 2
-    assert "give a task as package.module:Class" in capsys.readouterr().err
+    assert "give a configuration, or a class as package.module:Class" in capsys.readouterr().err
 
 
 def test_a_robots_own_model_decides_what_touches_the_floor(root, capsys):

@@ -15,12 +15,10 @@ from helpers.command_modules import COMMANDS, SMOKE, evaluate, render, train
 from helpers.damage import damage_about
 from helpers.reports import make_episodes, make_report
 from jetbot_mjx import cli, evaluation, training
+from jetbot_mjx.config import shipped_configs
 from jetbot_mjx.errors import UserError
 
-FILE_OR_NAME = (
-    "give a file, or one of camera_gpu, camera_real, gpu, isaac_sb3, jetbot, jetbot_camera,"
-    " jetbot_egocentric, real_jetbot, smoke, car, gates, obstacle, pillars, rover, turtlebot"
-)
+FILE_OR_NAME = f"give a file, or one of {', '.join(shipped_configs())}"
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,35 @@ FILES = {
         "    def reward(self, before, after, goal, action):\n"
         "        return {}['missing']\n"
     ),
+    "my_env.py": (
+        "import jax.numpy as jnp\n"
+        "from jetbot_mjx import State\n"
+        "class Balance:\n"
+        "    action_size = 1\n"
+        "    def reset(self, rng):\n"
+        "        zero = jnp.zeros(())\n"
+        "        return State(zero, jnp.zeros(2), zero, zero)\n"
+        "    def step(self, state, action):\n"
+        "        return state.replace(pipeline_state=action.sum())\n"
+        "class Endless(Balance):\n"
+        "    def step(self, state, action):\n"
+        "        return state.replace(reward=action[0] / 0.0)\n"
+        "class Deciding(Balance):\n"
+        "    def step(self, state, action):\n"
+        "        return state if action[0] > 0 else self.reset(None)\n"
+        "class Growing(Balance):\n"
+        "    def step(self, state, action):\n"
+        "        return state.replace(obs=jnp.zeros(3))\n"
+        "class Python(Balance):\n"
+        "    def step(self, state, action):\n"
+        "        return state.obs, 0.0, False, False, {}\n"
+        "class Counting(Balance):\n"
+        "    count = 0\n"
+        "    def step(self, state, action):\n"
+        "        self.count += 1\n"
+        "        return state.replace(reward=jnp.float32(self.count))\n"
+    ),
+    "my_env.yaml": "environment: my_env.py:Balance\n",
     "half_a_task.py": "class Docking(:\n",
 }
 

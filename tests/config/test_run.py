@@ -76,6 +76,83 @@ def test_brax_s_trainer_takes_every_configuration_of_the_package(name):
     config = load_config(name, ["trainer=brax"])
     assert (config.ppo.normalizer, config.ppo.network.shared_cnn) == ("brax", False)
     # A setting that is given is not replaced by a default.
-    with pytest.raises(ConfigError, match=r"ppo\.normalizer = 'physical' is not supported"):
+    own = config.environment is not None
+    told = "needs the units" if own else "is not supported"
+    with pytest.raises(ConfigError, match=rf"ppo\.normalizer = 'physical' {told}"):
         load_config(name, ["trainer=brax", "ppo.normalizer=physical"])
-    assert load_config(name).ppo.normalizer == "physical"
+    assert load_config(name).ppo.normalizer == ("brax" if own else "physical")
+
+
+OWN = "environment: hopper.py:Hopper"
+
+
+def test_an_environment_is_named_by_its_file_or_its_module(write):
+    for name in ("hopper.py:Hopper", "hopper:Hopper"):
+        config = load_config(write(f"environment: {name}"))
+        assert (config.environment, config.code) == ("hopper:Hopper", "hopper:Hopper")
+    assert load_config(write("environment: tools/park.py:A.B")).environment == "tools.park:A.B"
+    assert load_config(write("environment: brax.envs:get_environment")).code.startswith("brax.")
+    assert Config().code == Config().task.name
+
+
+def test_an_environment_has_no_units(write):
+    assert load_config(write(OWN)).ppo.normalizer == "brax"
+    # What is set beside it stays.
+    config = load_config(write(f"{OWN}\nppo: {{num_envs: 512}}"))
+    assert (config.ppo.normalizer, config.ppo.num_envs) == ("brax", 512)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        "task: {episode_length: 77}",
+        "physics: {impl: xla}",
+        "ppo: {network: {distribution_type: categorical}}",
+        "environment_options: {env_name: ant, depth: {of: [1, 2.5, null, true]}}",
+        "stop_at_return: -5.5",
+    ],
+)
+def test_an_environment_takes_what_is_not_of_the_robot(write, settings):
+    load_config(write(f"{OWN}\n{settings}"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ("environment: hopper.py", "with a file beside the configuration, or package.module:Class"),
+        ("environment: hopper.Hopper", "or package.module:Class, perhaps hopper:Hopper"),
+        (
+            "environment: 'my-env.py:Env'",
+            "environment: 'my-env.py:Env' is wrong: write file.py:Class",
+        ),
+        ("environment: examples", "environment: 'examples' is wrong: write file.py:Class"),
+        ("environment: examples/", "environment: 'examples/' is wrong: write file.py:Class"),
+        ("environment: 3", "environment = 3 is wrong: it should be text"),
+        (
+            f"{OWN}\ntask: {{observation: world, options: {{a: 1}}}}",
+            "task.options = {'a': 1} is of",
+        ),
+        (f"{OWN}\ntask: {{name: my_task:Mine}}", "task.name = 'my_task:Mine' is of the JetBot"),
+        (
+            f"{OWN}\nrobot: {{wheel_radius: 0.02}}",
+            "robot.wheel_radius = 0.02 is of the JetBot, which environment =",
+        ),
+        (f"{OWN}\ncamera: {{width: 16}}", "camera.width = 16 is of the JetBot"),
+        (f"{OWN}\nphysics: {{tolerance: 0.001}}", "physics.tolerance = 0.001 is of the JetBot"),
+        (f"{OWN}\nrandomization: {{mass: [0.9, 1.1]}}", "randomization.mass"),
+        (f"{OWN}\nppo: {{normalizer: physical}}", "needs the units of the observation, which"),
+        (f"{OWN}\nenvironment_options: {{1: 2}}", "environment_options"),
+        (f"{OWN}\nenvironment_options: [1]", "environment_options = [1]"),
+        (f"{OWN}\nenvironment_options: {{mass: .nan}}", "environment_options"),
+        ("environment_options: {a: 1}", "{'a': 1} are the arguments of an environment, and there"),
+        (
+            "ppo: {network: {distribution_type: categorical}}",
+            "is for an environment whose actions are choices, and those of the robot are numbers",
+        ),
+    ],
+)
+def test_what_does_not_fit_an_environment_is_refused(refusal, settings, told):
+    message = refusal(settings)
+    assert told in message
+    assert "\n" not in message
+    assert "perhaps hopper:py" not in message

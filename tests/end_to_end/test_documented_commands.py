@@ -153,6 +153,7 @@ def execute(page, words, reader, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Brax System", "ignore:Accessing")
 @pytest.mark.parametrize(("page", "words"), of_kind("python", "-m", "jetbot_mjx.train"))
 def test_a_documented_training_trains(page, words, reader, monkeypatch, capsys):
     if "wandb=jetbots" in words:
@@ -332,10 +333,10 @@ def test_the_page_about_real_robots_leads_to_a_comparison(reader, real_run, monk
 def test_documented_tasks_are_written_and_checked(tmp_path):
     found = [
         one.values
-        for name in ("new_task", "check_env", "new_robot", "check_robot")
+        for name in ("new_task", "new_env", "check_env", "new_robot", "check_robot")
         for one in of_kind("python", "-m", f"jetbot_mjx.{name}")
     ]
-    assert len(found) == 4
+    assert len(found) == 6
     for page, words in found:
         folder = tmp_path / page
         folder.mkdir(exist_ok=True)
@@ -345,9 +346,10 @@ def test_documented_tasks_are_written_and_checked(tmp_path):
         name = words[start].removeprefix("jetbot_mjx.")
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(folder)
-            if name == "new_robot":
-                # The page shows a shorter one of this name.
-                Path(words[start + 1]).unlink()
+            if name in ("new_robot", "new_env"):
+                # The page shows a file of this name, too.
+                for file in own_files(page).keys() & {words[start + 1], "my_env.yaml"}:
+                    Path(file).unlink()
             assert run(name, words[start + 1 :]) == 0, words
 
 
@@ -357,7 +359,8 @@ def test_no_kind_of_command_is_left_out():
     elsewhere = {("pip", "install"), ("apt-get", "install"), ("[", "$?"), ("break",), ("srun",)}
     elsewhere |= {("scp",), ("git", "clone"), ("cd",)}
     covered = {"train", "evaluate", "render", "replay", "play", "plan", "export", "sim2real"}
-    covered |= {"new_task", "check_env", "new_robot", "check_robot", "pretrained", "jetbot_mjx"}
+    covered |= {"new_task", "new_env", "check_env", "new_robot", "check_robot", "pretrained"}
+    covered.add("jetbot_mjx")
     # Tested by test_list_configs.py, test_list_runs.py and test_tune.py.
     covered |= {"configs", "runs", "tune"}
     for text, (_, words) in DOCUMENTED.items():

@@ -12,6 +12,7 @@ from jetbot_mjx import (
     export,
     list_configs,
     list_runs,
+    new_env,
     new_robot,
     new_task,
     plan,
@@ -61,6 +62,7 @@ KEYWORDS = {"until", "do", "done", "while", "if", "then", "fi"}
 
 COMMANDS = {
     "new_task": new_task,
+    "new_env": new_env,
     "check_env": check_env,
     "new_robot": new_robot,
     "check_robot": check_robot,

@@ -606,7 +606,7 @@ def test_an_ensemble_is_solved_alike_as_one_kernel_and_by_xla(tmp_path, monkeypa
 
 @pytest.mark.parametrize("friction", [None, 0.2])
 def test_robots_are_compared_with_c_mujoco_under_the_same_commands(friction, monkeypatch):
-    env = robot_fidelity.make_env(load_config("turtlebot")).blind()
+    env = robot_fidelity.make_jetbot_env(load_config("turtlebot")).blind()
     options = argparse.Namespace(robots=4, seconds=0.5, seed=0)
     row = robot_fidelity.measure("turtlebot", env, friction, options)
     assert row.is_right

@@ -43,7 +43,9 @@ from jetbot_mjx.config import (
     RobotParams,
     load_config,
     parse_config,
+    shipped_configs,
 )
+from jetbot_mjx.envs import write_environment_template
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs import metrics
@@ -684,6 +686,37 @@ def test_the_task_of_the_page_does_what_it_says(reader, monkeypatch):
     assert set(env.task.markers(goal)) == {"goal", "pillar"}
     between = jnp.linalg.norm(goal.goal_w[:2] / 2 - goal.pillar_w[:2])
     assert between < 0.1
+
+
+def test_the_environment_of_the_page_is_what_new_env_writes(tmp_path):
+    write_environment_template(tmp_path / "my_env.py")
+    shown = own_files("own-environment.md")
+    for name in ("my_env.py", "my_env.yaml"):
+        assert shown[name] == f"# {name}\n{(tmp_path / name).read_text('utf-8')}"
+
+
+@pytest.mark.filterwarnings("ignore:Brax System", "ignore:Accessing")
+@pytest.mark.parametrize(
+    ("name", "package", "sizes"),
+    [
+        ("brax_pendulum", "brax", (4, 1)),
+        ("playground_cartpole", "mujoco_playground", (5, 1)),
+        ("gymnax_cartpole", "gymnax", (4, 2)),
+    ],
+)
+def test_environments_of_other_libraries_are_built_as_the_page_says(name, package, sizes):
+    pytest.importorskip(package)
+    text = own_files("own-environment.md")[f"{name}.yaml"]
+    env = make_env(parse_config(YAML(typ="safe", pure=True).load(text)))
+    assert (env.observation_size, env.action_size) == sizes
+
+
+def test_the_standard_tasks_are_on_the_page():
+    table = PAGES["own-environment.md"].partition("## The standard tasks")[2]
+    names = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
+    shipped = {name: load_config(name).environment for name in shipped_configs()}
+    own = [name for name, environment in shipped.items() if environment]
+    assert {*names} == {name for name in own if not name.endswith("_gpu")}
 
 
 def test_every_part_of_the_contract_is_on_the_page(root):

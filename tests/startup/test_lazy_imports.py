@@ -124,6 +124,7 @@ MISTYPED = {
     "runs": ["--all"],
     "new-task": [],
     "check-env": [],
+    "new-env": [],
     "new-robot": [],
     "check-robot": [],
     "plan": [],

@@ -72,17 +72,22 @@ def describe_error(error: Exception, who: str, folders: Sequence[Path]) -> str:
 
 
 def changed_leaf(first: object, last: object) -> str:
-    """Return the first leaf whose shape or dtype differs between two states; empty if none."""
+    """Return the first leaf whose shape or dtype differs between two states, and how.
+
+    The text is empty if none differs.
+    """
     sides = [dict(jax.tree_util.tree_leaves_with_path(state)) for state in (first, last)]
     for path in (*sides[0], *sides[1]):
         one, other = (_type(side.get(path)) for side in sides)
         if one != other:
-            return jax.tree_util.keystr(path).lstrip(".")
+            return f"{jax.tree_util.keystr(path).lstrip('.')} from {one} to {other}"
     return ""
 
 
-def _type(leaf: jax.ShapeDtypeStruct | None) -> object:
-    return None if leaf is None else (leaf.shape, leaf.dtype, leaf.weak_type)
+def _type(leaf: jax.ShapeDtypeStruct | None) -> str:
+    if leaf is None:
+        return "nothing"
+    return f"{'weak ' * leaf.weak_type}{leaf.dtype}{list(leaf.shape)}"
 
 
 # Inputs and results of the methods.

@@ -1,0 +1,76 @@
+"""The import of a class of one's own, and what is said where it fails."""
+
+import sys
+
+import pytest
+
+from jetbot_mjx.config import task_modules
+from jetbot_mjx.envs.own_class import import_class
+from jetbot_mjx.errors import InvalidError, MissingPackageError
+
+FILES = {
+    "own_sound.py": "class Env:\n    class Inner:\n        pass\n",
+    "own_needy.py": "import own_absent_package\n",
+    "own_half.py": "class Env(:\n",
+    "own_package/__init__.py": "",
+    "own_package/inside.py": "class Env:\n    pass\n",
+}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    """The current folder, with some modules; what they leave in the process is undone."""
+    for name, text in FILES.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    monkeypatch.setattr(task_modules, "TASK_FOLDERS", {})
+    yield
+    for name in [name for name in sys.modules if name.startswith("own_")]:
+        del sys.modules[name]
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("own_sound:Env", "Env"),
+        ("own_sound:Env.Inner", "Env.Inner"),
+        ("own_package.inside:Env", "Env"),
+        ("collections:OrderedDict", "OrderedDict"),
+    ],
+)
+def test_a_class_is_found(name, found):
+    assert import_class("environment", name).__qualname__ == found
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "told"),
+    [
+        ("own_sound", InvalidError, "write package.module:Class$"),
+        ("own_sound.Env", InvalidError, "write package.module:Class, perhaps own_sound:Env$"),
+        (":Env", InvalidError, "write package.module:Class$"),
+        ("own_sound:", InvalidError, "write package.module:Class$"),
+        (".own_sound:Env", InvalidError, "write package.module:Class$"),
+        ("own_sound.py:Env", InvalidError, "names a file: write the module, own_sound:Env$"),
+        ("own_sound:env", InvalidError, "own_sound has no 'env': did you mean 'Env'[?]$"),
+        ("own_sound:Env.Other", InvalidError, "Env has no 'Other'$"),
+        ("own_half:Env", InvalidError, r"own_half.py, line 1, is not valid Python: "),
+        (
+            "own_soud:Env",
+            MissingPackageError,
+            "there is no own_soud.py beside the YAML file or in the current folder, and no such"
+            " package: did you mean own_sound:Env[?]$",
+        ),
+        ("own_package.nothing:Env", MissingPackageError, "there is no own_package/nothing.py"),
+        (
+            "own_needy:Env",
+            MissingPackageError,
+            "own_needy imports 'own_absent_package', which is not installed: install it$",
+        ),
+    ],
+)
+def test_what_cannot_be_imported_is_one_line(name, error, told):
+    with pytest.raises(error, match=f"^environment = '{name}'.*{told}") as caught:
+        import_class("environment", name)
+    assert "\n" not in str(caught.value)
