@@ -17,13 +17,15 @@ import jax
 import jax.numpy as jnp
 import mujoco
 from flax import struct
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import partial_eval
 from jaxtyping import Array, Float, PyTree, UInt32
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.devices import default_device_cpu
-from jetbot_mjx.envs.checks.probe import changed_leaf, describe_error
+from jetbot_mjx.envs.checks.errors import describe_error
+from jetbot_mjx.envs.checks.probe import changed_leaf
 from jetbot_mjx.envs.foreign import SUCCESS, Foreign, Outcome, as_foreign
 from jetbot_mjx.envs.kernel_impl import KernelImpl
 from jetbot_mjx.envs.own_class import import_class
@@ -301,7 +303,7 @@ def _make_jaxpr(function: Callable[..., Outcome], *like: PyTree) -> tuple[Closed
       InvalidError: it uses what an earlier call has left behind.
     """
     traced, results = jax.make_jaxpr(function, return_shape=True)(*like)
-    if any(isinstance(x, jax.core.Tracer) for x in traced.consts):
+    if any(isinstance(x, Tracer) for x in traced.consts):
         raise InvalidError(
             f"{function.__name__} uses a value that an earlier call kept in self: keep what changes"
             " in the state"
