@@ -8,22 +8,14 @@ a class with the settings of a run. Of an environment of your own, sizes and cos
 import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from jetbot_mjx import cli, startup
 from jetbot_mjx.config import YAML_ENDINGS, Config, shipped_configs
-from jetbot_mjx.fallbacks import collect
 
 BROKEN = 1
 """Exit code for a task or an environment that has an error."""
 
 _BUILT_IN = "jetbot_mjx"
-
-_INSTANCES = 1024
-"""Instances of the rate."""
-
-_INSTANCES_WITHOUT_KERNEL = 16
-"""Those of an environment whose step is no kernel: of many, it could take minutes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -58,7 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _tell(config, about, envs.check_task(config))
     code = _tell(config, envs.ENVIRONMENT_CHECKS, envs.check_environment(config))
     if code == 0:
-        _tell_cost(envs.make_env(config))
+        for label, text in envs.describe_environment(config):
+            cli.tell(f"{label:10} {text}")
     return code
 
 
@@ -99,34 +92,6 @@ def _tell(
     total = f"{errors} error{'s' * (errors > 1)}" if errors else "no errors"
     cli.tell(f"{config.code}: {total}")
     return BROKEN if errors else 0
-
-
-def _tell_cost(env: Any) -> None:
-    """Print sizes of an environment of one's own, what its step is as a kernel, and the rate."""
-    import jax
-    import jax.numpy as jnp
-
-    import onekernel
-    from jetbot_mjx.envs import step_rate
-
-    kind = "choices" if env.is_discrete else f"action{'s' * (env.action_size > 1)}"
-    cli.tell(f"{'sizes':10} {env.observation_size} observations, {env.action_size} {kind}")
-    cli.tell(f"{'metrics':10} {', '.join(env.metrics) or 'none'}")
-    state = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), jnp.uint32))
-    kept = jax.tree.leaves(state.pipeline_state)
-    cli.tell(f"{'state':10} {sum(x.size for x in kept)} numbers that a later step reads")
-    arguments = state, jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
-    one = onekernel.fuse(env.step, on_unsupported="xla")
-    onekernel.explain(one, *arguments)
-    is_kernel = isinstance(one.lowered(*arguments).one, onekernel.Kernel) and env.may_be_kernel
-    instances = _INSTANCES if is_kernel else _INSTANCES_WITHOUT_KERNEL
-    # The reason why there is no kernel was told above.
-    with collect():
-        rate = step_rate(env, instances)
-    device = jax.devices()[0].device_kind
-    cli.tell(
-        f"{'rate':10} {rate:,.2g} environment steps/s of {instances:,} instances on this {device}"
-    )
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from .camera.wrapper import see as see
 from .camera.wrapper import with_camera as with_camera
 from .checks.own_environment import ENVIRONMENT_CHECKS as ENVIRONMENT_CHECKS
 from .checks.own_environment import check_environment as check_environment
+from .checks.own_environment import describe_environment as describe_environment
 from .checks.own_environment import require_sound as require_sound
 from .checks.runner import CHECKS as CHECKS
 from .checks.runner import check_task as check_task

@@ -24,7 +24,8 @@ from jaxtyping import Array, Float, PyTree, UInt32
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.devices import default_device_cpu
-from jetbot_mjx.envs.checks.probe import changed_leaf, describe_error
+from jetbot_mjx.envs.checks.errors import describe_error
+from jetbot_mjx.envs.checks.probe import changed_leaf
 from jetbot_mjx.envs.foreign import SUCCESS, Foreign, Outcome, as_foreign
 from jetbot_mjx.envs.kernel_impl import KernelImpl
 from jetbot_mjx.envs.own_class import import_class

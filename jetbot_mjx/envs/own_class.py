@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jetbot_mjx.config import find_task_here
+from jetbot_mjx.envs.checks.errors import describe_error
 from jetbot_mjx.errors import InvalidError, MissingPackageError, UserError
 
 
@@ -53,9 +54,6 @@ def import_class(key: str, name: str) -> Any:
     except UserError:
         raise
     except Exception as error:
-        # Only a mistake needs it.
-        from jetbot_mjx.envs.checks.probe import describe_error
-
         described = describe_error(error, f"the import of {module_name}", ())
         raise InvalidError(f"{key} = {name!r}: {described}") from error
     found, owner = module, module_name

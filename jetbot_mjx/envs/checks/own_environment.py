@@ -13,20 +13,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+import onekernel
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.adapted_env import AdaptedEnv
 from jetbot_mjx.envs.checks.probe import first_key
 from jetbot_mjx.envs.program_key import own_fingerprint
+from jetbot_mjx.envs.robot_facts import step_rate
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.errors import InvalidError, UserError
+from jetbot_mjx.fallbacks import collect
 
 INSTANCES, STEPS = 16, 64
 """Number of instances of the drive, and of environment steps of each."""
 
+_MANY = 1024
+"""Instances of the rate; of those without a kernel so many could take minutes."""
+
 _LONGEST_RESET = 2.0
 """[s] what a reset of all instances may take."""
 
-_QUICKLY = {"xla_backend_optimization_level": 0}
+_QUICKLY: dict[str, str | bool] = {"xla_backend_optimization_level": "0"}
 """Options by which XLA compiles for a CPU in a third of the time; these programs run only once."""
 
 _RARE = 0.01
@@ -60,6 +66,34 @@ def check_environment(config: Config) -> Iterator[tuple[str, list[str]]]:
     yield "purity", findings
     if not findings:
         yield "drive", list(_faults(env, rare=0.0))
+
+
+def describe_environment(config: Config) -> Iterator[tuple[str, str]]:
+    """Tell the sizes of an environment, and its rate; what its step is as a kernel is printed.
+
+    Args:
+      config: the configuration of the run, which has an `environment`.
+
+    Yields:
+      A label and a text.
+    """
+    env = AdaptedEnv(config)
+    kind = "choices" if env.is_discrete else f"action{'s' * (env.action_size > 1)}"
+    yield "sizes", f"{env.observation_size} observations, {env.action_size} {kind}"
+    yield "metrics", ", ".join(env.metrics) or "none"
+    state = jax.eval_shape(env.reset, first_key())
+    kept = sum(x.size for x in jax.tree.leaves(state.pipeline_state))
+    yield "state", f"{kept} numbers that a later step reads"
+    arguments = state, jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
+    one = onekernel.fuse(env.step, on_unsupported="xla")
+    onekernel.explain(one, *arguments)
+    is_kernel = isinstance(one.lowered(*arguments).one, onekernel.Kernel) and env.may_be_kernel
+    instances = _MANY if is_kernel else INSTANCES
+    # The reason why there is no kernel was told above.
+    with collect():
+        rate = step_rate(env, instances)
+    device = jax.devices()[0].device_kind
+    yield "rate", f"{rate:,.2g} environment steps/s of {instances:,} instances on this {device}"
 
 
 def require_sound(env: AdaptedEnv) -> None:

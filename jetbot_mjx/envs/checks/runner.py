@@ -15,12 +15,12 @@ import numpy as np
 from jetbot_mjx.config import Config, MjcfRobotConfig
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.checks import methods
+from jetbot_mjx.envs.checks.errors import describe_error
 from jetbot_mjx.envs.checks.probe import (
     DRAWS,
     TaskProbe,
     call_methods,
     changed_leaf,
-    describe_error,
     first_key,
 )
 from jetbot_mjx.envs.jetbot_env import make_jetbot_env
