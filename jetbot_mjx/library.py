@@ -166,7 +166,8 @@ def render(
     Args:
       run: a run or checkpoint, named as for `evaluate`.
       which: the checkpoint of a run: `"best"`, `"last"` or a number of steps.
-      episodes: the number of goals, from the first on (default: 20, of a gallery 4).
+      episodes: the number of goals, from the first on (default: 20, of a gallery 4); in an
+        `environment` that of episodes (default: 3).
       goals: these of the fixed goals, such as `[3, 17]`, in place of `episodes`.
       many: that many robots in one scene, each with its own goal.
       gallery: whether to render the first, the middle and the last checkpoint side by side.
@@ -202,8 +203,7 @@ def render(
             )
         if many is not None:
             return viewers.render_many(find_run(run), robots=many, which=which)
-        count = 20 if episodes is None else episodes
-        return viewers.render_run(find_run(run), episodes=count, goals=goals, which=which)
+        return viewers.render_run(find_run(run), episodes=episodes, goals=goals, which=which)
 
 
 def tune(

@@ -17,7 +17,8 @@ def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx render", description=__doc__)
     cli.add_checkpoint_arguments(parser)
     group = parser.add_mutually_exclusive_group()
-    first = "drive to the first N of the fixed goals (default: 20; 4 with --gallery)"
+    defaults = "default: 20; 4 with --gallery; 3 in an environment"
+    first = f"drive to the first N of the fixed goals ({defaults})"
     cli.add_count(group, "--episodes", first, most=REPORT_GOALS)
     group.add_argument(
         "--goals",
@@ -65,7 +66,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import (
             GALLERY_EPISODES,
-            VIDEO_EPISODES,
             render_gallery,
             render_many,
             render_run,
@@ -80,8 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif options.many:
             rendered = render_many(run, robots=options.many, which=which)
         else:
-            count = episodes or VIDEO_EPISODES
-            rendered = render_run(run, episodes=count, goals=options.goals, which=which)
+            rendered = render_run(run, episodes=episodes, goals=options.goals, which=which)
     cli.tell(rendered.describe())
     return 0
 

@@ -4,6 +4,7 @@
     action, wheel_speeds = act(obs)            # a policy that observes numbers
     action, wheel_speeds = act(image)          # a policy that sees
     action, wheel_speeds = act(image, state)   # a policy that sees, and observes numbers too
+    action = act(obs)                          # a policy of an environment without wheels
 
 `policy.json` describes the inputs. `act` applies the normaliser, the network, the clip to [-1, 1]
 and the controller that converts an action to wheel speeds. It does not compute motor values, which
@@ -16,7 +17,7 @@ import json
 import os
 import sys
 import time
-from typing import Optional
+from typing import Any, Optional
 
 import numpy as np
 
@@ -110,7 +111,7 @@ def _convolve(x: np.ndarray, kernel: np.ndarray, stride: int) -> np.ndarray:
     return np.dot(squares, kernel.reshape(squares.shape[1], -1)).reshape(count, rows, columns, -1)
 
 
-def act(obs: np.ndarray, state: Optional[np.ndarray] = None) -> tuple:
+def act(obs: np.ndarray, state: Optional[np.ndarray] = None) -> Any:
     """Return the action and the wheel speeds for one observation or a batch.
 
     Args:
@@ -120,7 +121,8 @@ def act(obs: np.ndarray, state: Optional[np.ndarray] = None) -> tuple:
 
     Returns:
       The action in [-1, 1], and the wheel speeds (left, right) [rad/s] that it commands, before the
-      limits of any motor; for a batch, one row each.
+      limits of any motor; for a batch, one row each. Without wheels, the action only; an action
+      that is a choice has 1 at its place and 0 elsewhere.
 
     Raises:
       ValueError: The observation has another shape or type, or there are too many parts.
@@ -137,10 +139,12 @@ def act(obs: np.ndarray, state: Optional[np.ndarray] = None) -> tuple:
         x = _activate(np.dot(x, kernel) + bias)
     kernel, bias = _LAYERS[-1]
     x = np.dot(x, kernel) + bias
+    if ABOUT.get("choice"):
+        return np.eye(x.shape[-1], dtype=np.float32)[np.argmax(x, axis=-1)]
     if ABOUT["squash"]:
         x = np.tanh(x)
     action = np.clip(x, np.float32(-1), np.float32(1))
-    return action, wheel_speeds(action)
+    return action if ABOUT["controller"] is None else (action, wheel_speeds(action))
 
 
 def wheel_speeds(action: np.ndarray) -> np.ndarray:
@@ -179,24 +183,26 @@ def check(path: str) -> float:
     Returns:
       The largest difference of any number, wheel speeds as a share of the fastest.
     """
-    about = ABOUT["controller"]
+    about = ABOUT["controller"] or {}
     turn = 0.5 * about.get("max_yaw_rate", 0.0) * about.get("wheel_separation", 0.0)
     fastest = (about.get("max_speed", 1.0) + turn) / about.get("wheel_radius", 1.0)
-    inputs, (wanted_action, wanted_wheels) = _recorded(path)
+    inputs, wanted = _recorded(path)
     worst = [0.0]
     # Piece by piece, since all images at once would fill the memory of a small computer.
-    for start in range(0, len(wanted_action), 100):
+    for start in range(0, len(wanted[0]), 100):
         piece = slice(start, start + 100)
-        action, wheels = act(*(part[piece] for part in inputs))
-        worst.append(np.abs(action - wanted_action[piece]).max())
-        worst.append(np.abs(wheels - wanted_wheels[piece]).max() / fastest)
+        found = act(*(part[piece] for part in inputs))
+        found = found if about else (found,)
+        for one, right, unit in zip(found, wanted, (1.0, fastest)):
+            worst.append(np.abs(one - right[piece]).max() / unit)
     return float(max(worst))
 
 
 def _recorded(path: str) -> tuple:
     with np.load(path) as recording:
         inputs = [recording[name] for name in ABOUT["inputs"]]
-        return inputs, (recording["action"], recording["wheel_speeds"])
+        names = ("action", "wheel_speeds") if ABOUT["controller"] else ("action",)
+        return inputs, [recording[name] for name in names]
 
 
 def _main() -> int:

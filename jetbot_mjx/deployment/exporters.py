@@ -42,8 +42,6 @@ _TEXT_WIDTH = 96
 _ONNX_OPSET = 13
 _ONNX_IR_VERSION = 7
 
-_OUTPUTS = ["action", "wheel_speeds"]
-
 _PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
 Act = Callable[..., Outputs]
@@ -75,7 +73,8 @@ def _write_numpy(policy: PortablePolicy, _: Act, path: Path) -> None:
         "strides": [one.stride for one in convolutions],
         "activation": policy.activation,
         "squash": policy.squash,
-        "controller": policy.controller._asdict(),
+        "choice": policy.is_choice,
+        "controller": policy.controller and policy.controller._asdict(),
     }
     numbers = base64.b64encode(b"".join(np.asarray(a, "<f4").tobytes() for a in arrays)).decode()
     lines = "\n".join(re.findall(f".{{1,{_TEXT_WIDTH}}}", numbers))
@@ -91,7 +90,15 @@ def _numpy_text(about: JsonObject, numbers: str) -> str:
 
 def _read_numpy(path: Path) -> Act:
     # An import would leave bytecode in a folder that is copied to a robot.
-    return _module_of(path.read_text("utf-8"), path).act
+    return _act_of(path.read_text("utf-8"), path)
+
+
+def _act_of(text: str, path: Path) -> Act:
+    """Return the function of a file's text, which returns no tuple where there is one output."""
+    module = _module_of(text, path)
+    if module.ABOUT["controller"] is None:
+        return lambda *inputs: (module.act(*inputs),)
+    return module.act
 
 
 def _module_of(text: str, path: Path) -> types.ModuleType:
@@ -122,7 +129,7 @@ def read_exported(folder: Path) -> Policy:
         if about is None or numbers is None:
             raise ValueError("its numbers are missing")
         known = json.loads(about[1])
-        act = _module_of(_numpy_text(known, numbers[1]), path).act
+        act = _act_of(_numpy_text(known, numbers[1]), path)
         # What is missing or does not fit shows in the first action.
         zeros = {"image": np.zeros(known["image"] or 0, np.uint8)}
         act(*(zeros.get(name, np.zeros(known["shapes"][0])) for name in known["inputs"]))
@@ -189,6 +196,26 @@ class _OnnxGraph:
         bias = self.constant(f"bias_{name}", layer.bias)
         return self.node("Gemm", x, kernel, bias, out=f"layer_{name}")
 
+    def action(self, policy: PortablePolicy, x: str) -> None:
+        """Add the outputs, from the last layer `x`."""
+        constant, node = self.constant, self.node
+        if policy.is_choice:
+            size = policy.layers[-1].bias.size
+            chosen = node("ArgMax", x, out="choice", axis=1, keepdims=0)
+            numbers = constant("choices", [size]), constant("off_on", [0.0, 1.0])
+            node("OneHot", chosen, *numbers, out="action")
+        else:
+            if policy.squash:
+                x = node("Tanh", x, out="squashed")
+            node("Clip", x, constant("low", -1.0), constant("high", 1.0), out="action")
+        if policy.controller is None:
+            return
+        # Append the controller, which is linear in the action; half speed is a drive of 0.
+        rows = policy.controller.mixing
+        half = 0.0 if isinstance(policy.controller, OwnController) else 1.0
+        offset = constant("half_speed", half * np.asarray(rows[0]))
+        node("Gemm", "action", constant("mixing", rows), offset, out="wheel_speeds")
+
     def features(self, encoder: Encoder) -> str:
         """Add the encoder of the input `image`; ONNX has the channels before rows and columns."""
         from onnx import TensorProto
@@ -225,14 +252,7 @@ def _write_onnx(policy: PortablePolicy, _: Act, path: Path) -> None:
         elif index < last:
             kind = {"tanh": "Tanh", "relu": "Relu", "elu": "Elu"}[policy.activation]
             x = node(kind, x, out=f"hidden_{index}")
-    if policy.squash:
-        x = node("Tanh", x, out="squashed")
-    node("Clip", x, constant("low", -1.0), constant("high", 1.0), out="action")
-    # Append the controller, which is linear in the action; half speed is a drive of 0.
-    rows = policy.controller.mixing
-    half = 0.0 if isinstance(policy.controller, OwnController) else 1.0
-    offset = constant("half_speed", half * np.asarray(rows[0]))
-    node("Gemm", "action", constant("mixing", rows), offset, out="wheel_speeds")
+    graph.action(policy, x)
 
     def tensor(name: str, shape: Sequence[int], dtype: DTypeLike) -> "onnx.ValueInfoProto":
         kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
@@ -244,7 +264,7 @@ def _write_onnx(policy: PortablePolicy, _: Act, path: Path) -> None:
             graph.nodes,
             "policy",
             [tensor(name, x.shape, x.dtype) for name, x in policy.inputs.items()],
-            [tensor(name, [len(rows)], np.float32) for name in _OUTPUTS],
+            [tensor(name, [size], np.float32) for name, size in policy.outputs.items()],
             graph.constants,
         ),
         opset_imports=[helper.make_opsetid("", _ONNX_OPSET)],
@@ -264,9 +284,7 @@ def _read_onnx(path: Path) -> Act:
     names = [one.name for one in session.get_inputs()]
 
     def act(*inputs: np.ndarray) -> Outputs:
-        outputs = session.run(_OUTPUTS, dict(zip(names, inputs, strict=True)))
-        action, wheel_speeds = map(np.asarray, outputs)
-        return action, wheel_speeds
+        return tuple(map(np.asarray, session.run(None, dict(zip(names, inputs, strict=True)))))
 
     return act
 

@@ -3,7 +3,8 @@
 An exported policy is one function of a batch of observations: `obs`, numbers, or `image`, and
 `state`, the numbers beside it, if there are any. It applies the normaliser, the network, the
 distribution's mode, the environment's clip to [-1, 1] and the controller that converts an action to
-wheel speeds; it returns both the actions and the wheel speeds.
+wheel speeds; it returns both the actions and the wheel speeds. In an environment of one's own there
+are no wheels: it returns the actions only.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,9 +17,9 @@ from jaxtyping import Array, Float, PyTree
 
 from jetbot_mjx import envs
 from jetbot_mjx.agents import CNNS, ENCODER, HEAD, make_networks, make_policy
-from jetbot_mjx.envs import NUMBERS, PIXELS, JetBotEnv, Observation
+from jetbot_mjx.envs import NUMBERS, PIXELS, AdaptedEnv, JetBotEnv, Observation
 from jetbot_mjx.evaluation import report_keys
-from jetbot_mjx.runs import Checkpoint
+from jetbot_mjx.runs import Checkpoint, Setup
 from jetbot_mjx.terminal import stage
 
 RECORDED, RECORDED_IMAGES = 10_000, 1_000
@@ -30,8 +31,15 @@ TOLERANCE = 1e-5
 _PARTS = {"image": PIXELS, "state": NUMBERS}
 """Inputs of a policy that sees, and their keys in the environment's observation."""
 
-Outputs = tuple[Float[Array | np.ndarray, "n action"], Float[Array | np.ndarray, "n _"]]
-"""Actions in [-1, 1], and the wheel speeds (left, right) [rad/s] that they command."""
+Outputs = tuple[Float[Array | np.ndarray, "n _"], ...]
+"""Actions in [-1, 1], and of a robot the wheel speeds (left, right) [rad/s] that they command."""
+
+_CLEAR_CHOICE = 1e-4
+"""Smallest difference of the two largest outputs of the network for a recorded choice: where
+they are closer, round-off chooses."""
+
+_RECORDED_AT_ONCE = 16
+"""Number of environments of one's own that are stepped at once."""
 
 
 class Controller(NamedTuple):
@@ -141,7 +149,18 @@ class PortablePolicy(NamedTuple):
     """Activation between the layers."""
     squash: bool
     """Whether tanh follows the last layer; the clip to [-1, 1] follows in any case."""
-    controller: AnyController
+    controller: AnyController | None
+    """None: what an action means is known to the environment alone."""
+    is_choice: bool = False
+    """Whether the action is 1 at the largest output of the last layer, and 0 elsewhere."""
+
+    @property
+    def outputs(self) -> dict[str, int]:
+        """Return the size of each output by its name, in their order."""
+        size = self.layers[-1].bias.size
+        if self.controller is None:
+            return {"action": size}
+        return {"action": size, "wheel_speeds": len(self.controller.mixing[0])}
 
     @property
     def inputs(self) -> dict[str, jax.ShapeDtypeStruct]:
@@ -159,12 +178,17 @@ class Recording(NamedTuple):
     inputs: Mapping[str, np.ndarray]
     """Inputs of the policy by their names, in their order, each with a batch axis."""
     action: Float[np.ndarray, "n action"]
-    wheel_speeds: Float[np.ndarray, "n _"]
+    wheel_speeds: Float[np.ndarray, "n _"] | None
     """(left, right) [rad/s]; of a car (wheel speed [rad/s], curvature [1/m]); the action itself
-    where only the robot's own function knows what it means."""
+    where only the robot's own function knows what it means. None in an environment of one's own."""
+
+    @property
+    def outputs(self) -> Outputs:
+        """Return JAX's outputs, as another implementation's."""
+        return (self.action,) if self.wheel_speeds is None else (self.action, self.wheel_speeds)
 
 
-def portable_policy(checkpoint: Checkpoint, env: JetBotEnv) -> PortablePolicy:
+def portable_policy(checkpoint: Checkpoint, env: JetBotEnv | AdaptedEnv) -> PortablePolicy:
     """Extract a policy from a checkpoint.
 
     Args:
@@ -200,7 +224,8 @@ def portable_policy(checkpoint: Checkpoint, env: JetBotEnv) -> PortablePolicy:
         layers=tuple(layers),
         activation=network.activation,
         squash=network.distribution_type == "tanh_normal",
-        controller=_controller(env.drive),
+        controller=None if isinstance(env, AdaptedEnv) else _controller(env.drive),
+        is_choice=network.distribution_type == "categorical",
     )
 
 
@@ -241,7 +266,7 @@ def _encoder(cnn: str, image_shape: Sequence[int], params: PyTree) -> Encoder:
     )
 
 
-def as_jax(checkpoint: Checkpoint, env: JetBotEnv) -> Callable[..., Outputs]:
+def as_jax(checkpoint: Checkpoint, env: JetBotEnv | AdaptedEnv) -> Callable[..., Outputs]:
     """Return the policy as used in training and evaluation, the reference for every export.
 
     Args:
@@ -266,6 +291,8 @@ def as_jax(checkpoint: Checkpoint, env: JetBotEnv) -> Callable[..., Outputs]:
             obs = dict(zip(_PARTS.values(), inputs, strict=False))
         with jax.default_matmul_precision("highest"):
             action = jnp.clip(policy(obs), -1.0, 1.0)
+        if isinstance(env, AdaptedEnv):
+            return (action,)
         return action, jax.vmap(env.wheel_targets)(action)
 
     return act
@@ -307,6 +334,44 @@ def record(checkpoint: Checkpoint, env: JetBotEnv, count: int | None = None) -> 
     return Recording(inputs, action, wheel_speeds)
 
 
+def record_environment(checkpoint: Checkpoint, setup: Setup, count: int = RECORDED) -> Recording:
+    """Run a policy in an environment of one's own, and record the observations.
+
+    Args:
+      checkpoint: The checkpoint of the policy.
+      setup: Its environment and networks.
+      count: Number of observations, of which those without a clear choice are left out.
+
+    Returns:
+      The recording, the same for the same checkpoint on the same machine.
+    """
+    batch, act = setup.training_env, as_jax(checkpoint, setup.env)
+
+    @jax.jit
+    def run(keys: Array) -> Array:
+        def step(state: PyTree, _: None) -> tuple[PyTree, Array]:
+            return batch.step(state, act(state.obs)[0]), state.obs
+
+        steps = -(-count // _RECORDED_AT_ONCE)
+        return jax.lax.scan(step, batch.reset(keys), length=steps)[1]
+
+    with stage("observations of the environment", count):
+        found = np.asarray(run(report_keys(_RECORDED_AT_ONCE)))
+    obs = found.reshape(-1, found.shape[-1])[:count]
+    if portable_policy(checkpoint, setup.env).is_choice:
+        obs = obs[_clear_choices(checkpoint, obs)]
+    (action,) = jax.device_get(jax.jit(act)(obs))
+    return Recording({"obs": obs}, action, None)
+
+
+def _clear_choices(checkpoint: Checkpoint, obs: Float[np.ndarray, "n obs"]) -> np.ndarray:
+    """Return for which observations the choice of a policy does not depend on round-off."""
+    params = checkpoint.params
+    outputs = checkpoint.networks.policy_network.apply(params.normalizer, params.policy, obs)
+    second, first = np.sort(np.asarray(outputs), axis=-1)[:, -2:].T
+    return first - second > _CLEAR_CHOICE
+
+
 def _inputs(obs: Observation) -> dict[str, np.ndarray]:
     """Return an observation of the environment as inputs of an exported policy."""
     if not isinstance(obs, dict):
@@ -314,7 +379,7 @@ def _inputs(obs: Observation) -> dict[str, np.ndarray]:
     return {name: obs[key] for name, key in _PARTS.items() if key in obs}
 
 
-def difference(recording: Recording, outputs: Outputs, controller: AnyController) -> float:
+def difference(recording: Recording, outputs: Outputs, controller: AnyController | None) -> float:
     """Return the largest difference of another implementation's results from JAX's.
 
     Args:
@@ -327,8 +392,8 @@ def difference(recording: Recording, outputs: Outputs, controller: AnyController
       where an output has another shape or is not finite.
     """
     worst = 0.0
-    pairs = ((recording.action, 1.0), (recording.wheel_speeds, controller.fastest))
-    for (wanted, unit), found in zip(pairs, outputs, strict=True):
+    units = [1.0, controller.fastest] if controller else [1.0]
+    for wanted, unit, found in zip(recording.outputs, units, outputs, strict=True):
         values = np.asarray(found)
         if values.shape != wanted.shape or not np.all(np.isfinite(values)):
             return float("inf")

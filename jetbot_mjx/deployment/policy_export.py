@@ -16,8 +16,10 @@ from jetbot_mjx.deployment.numpy_policy import (
     difference,
     portable_policy,
     record,
+    record_environment,
 )
-from jetbot_mjx.deployment.policy_spec import FILE, policy_spec
+from jetbot_mjx.deployment.policy_spec import FILE, environment_spec, policy_spec
+from jetbot_mjx.envs import AdaptedEnv
 from jetbot_mjx.errors import UserError, requires_extra
 from jetbot_mjx.terminal import stage
 
@@ -68,7 +70,8 @@ def export_policy(
     # Load the policy.
     checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
     folder = checkpoint.results_dir / FOLDER if output is None else Path(output)
-    env = checkpoint.make_setup().robot_env
+    setup = checkpoint.make_setup()
+    env = setup.env
     policy, reference = portable_policy(checkpoint, env), as_jax(checkpoint, env)
     with runs.writing_to(folder):
         if folder.exists() and not (folder / FILE).is_file():
@@ -76,7 +79,12 @@ def export_policy(
                 f"{folder} exists and is not an export: choose a new folder with --output"
             )
     with runs.atomic_folder(folder) as unfinished:
-        recording = record(checkpoint, env)
+        if isinstance(env, AdaptedEnv):
+            recording = record_environment(checkpoint, setup)
+            spec = environment_spec(checkpoint, env, policy)
+        else:
+            recording = record(checkpoint, env)
+            spec = policy_spec(checkpoint, env, policy)
         # Write each format and check its output against JAX.
         differences = {}
         for name in formats:
@@ -92,15 +100,15 @@ def export_policy(
                 )
             differences[name] = found
         # Write the observations and the description of all files.
-        _write_spec(unfinished, policy_spec(checkpoint, env, policy), differences, recording)
+        _write_spec(unfinished, spec, differences, recording)
     return ExportedPolicy(folder, checkpoint.env_steps, differences, len(recording.action))
 
 
 def _write_spec(
     folder: Path, spec: runs.JsonObject, differences: Mapping[str, float], recording: Recording
 ) -> None:
-    arrays = {**recording.inputs, **recording._asdict()}
-    del arrays["inputs"]
+    outputs = dict(zip(("action", "wheel_speeds"), recording.outputs, strict=False))
+    arrays = {**recording.inputs, **outputs}
     np.savez_compressed(folder / RECORDING, **arrays)
     spec["files"] = {
         name: {"file": FORMATS[name].file, "largest_difference": found}

@@ -17,6 +17,7 @@ from jetbot_mjx.envs import (
     QPOS_QUAT,
     QPOS_XYZ,
     AckermannDrive,
+    AdaptedEnv,
     DifferentialDrive,
     JetBotEnv,
     Layout,
@@ -81,17 +82,9 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
         "robot": config.robot.model_dump(mode="json"),
         "control_rate": 1.0 / env.dt,
         "control_period": env.dt,
-        "inputs": [
-            {"name": name, "dtype": str(np.dtype(one.dtype)), "shape": list(one.shape)}
-            for name, one in policy.inputs.items()
-        ],
+        "inputs": _inputs(policy),
         "observation": _observations(env.task.layout),
-        "network": {
-            **(_sizes(encoder) if encoder else {}),
-            "layers": [layer.bias.size for layer in policy.layers],
-            "activation": policy.activation,
-            "squash": "tanh" if policy.squash else None,
-        },
+        "network": _network(policy),
         "success_radius": config.task.success_radius,
         "goal_height": GOAL_HEIGHT,
         "rest_height": float(rest[QPOS_XYZ][2]),
@@ -99,6 +92,56 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
         "episode_seconds": config.task.episode_length * env.dt,
         "evaluation": _evaluation(checkpoint),
         "versions": versions(),
+    }
+
+
+def environment_spec(checkpoint: Checkpoint, env: AdaptedEnv, policy: PortablePolicy) -> JsonObject:
+    """Return the spec of a policy of an environment of one's own, as `policy_spec` does.
+
+    Args:
+      checkpoint: The checkpoint of the policy.
+      env: The environment that the policy was trained in.
+      policy: The policy as arrays.
+    """
+    config, template = checkpoint.config, _template()
+    low, what = (0.0, "choice") if policy.is_choice else (-1.0, "action")
+    last = "1 at the largest output, 0 elsewhere" if policy.is_choice else "clip to [-1, 1]"
+    return {
+        "format": template["format"],
+        "run": checkpoint.run_dir.name,
+        "env_steps": checkpoint.env_steps,
+        "environment": config.environment,
+        "environment_options": config.environment_options,
+        "control_rate": None if env.dt is None else 1.0 / env.dt,
+        "control_period": env.dt,
+        "inputs": _inputs(policy),
+        "observation": _observations(env.layout),
+        "action": [
+            {"name": f"{what}_{i}", "index": i, "unit": "1", "low": low, "high": 1.0}
+            for i in range(env.action_size)
+        ],
+        "inside": ["normaliser", "network", last],
+        "outside": ["what the environment makes of an action"],
+        "network": _network(policy),
+        "episode_steps": config.task.episode_length,
+        "evaluation": _evaluation(checkpoint),
+        "versions": versions(),
+    }
+
+
+def _inputs(policy: PortablePolicy) -> list[JsonObject]:
+    return [
+        {"name": name, "dtype": str(np.dtype(one.dtype)), "shape": list(one.shape)}
+        for name, one in policy.inputs.items()
+    ]
+
+
+def _network(policy: PortablePolicy) -> JsonObject:
+    return {
+        **(_sizes(policy.encoder) if policy.encoder else {}),
+        "layers": [layer.bias.size for layer in policy.layers],
+        "activation": policy.activation,
+        "squash": "tanh" if policy.squash else None,
     }
 
 
@@ -112,6 +155,7 @@ def _describe_drive(spec: JsonObject, policy: PortablePolicy, env: JetBotEnv) ->
             for i in range(policy.controller.action_size)
         ]
         spec["wheel_speeds"] = {"order": [one["name"] for one in spec["action"]], "unit": "1"}
+    assert policy.controller
     spec["wheel_speeds"] |= policy.controller._asdict()
     spec["wheel_speeds"]["limit_in_training"] = env.robot.max_wheel_speed
     if actuators := _actuators(env):

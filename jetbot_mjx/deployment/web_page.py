@@ -223,7 +223,7 @@ def _export(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) -> d
             "strides": [],
             "activation": policy.activation,
             "squash": policy.squash,
-            "controller": policy.controller._asdict(),
+            "controller": policy.controller and policy.controller._asdict(),
         },
         "spec": {**spec, "evaluation": None, "files": {"numpy": {"file": "policy.py"}}},
     }

@@ -6,7 +6,9 @@ timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.p
   eval/success_rate         success rate; interval: success_low, success_high
   eval/time_to_goal_median  [s] median time of the successes; 95th percentile: time_to_goal_p95
   eval/path_efficiency      straight line over distance travelled, mean over the successes
-  eval/episode_return       [m] mean sum of rewards, about the distance covered
+  eval/episode_return       [m] mean sum of rewards, about the distance covered; of an `environment`
+                            in its own unit, with return_low, return_high, return_min
+  eval/episode_length       steps until the end, mean; of an `environment` only
   eval/final_distance_median  [m] distance to the goal at the end, on the floor
   eval/nonfinite_envs       episodes that were cut off because of a non-finite state
   loss/total, policy, value, entropy  means over the interval, as Brax computes them
@@ -203,12 +205,30 @@ _LAYOUT = {
 }
 """Charts of TensorBoard's tab of custom scalars, so that success comes first."""
 
+_RETURN_LAYOUT = {
+    "return": {
+        "mean return, 95 % interval": [
+            "Margin",
+            ["eval/episode_return", "eval/return_low", "eval/return_high"],
+        ],
+        "mean return, and that of the exploring policy": [
+            "Multiline",
+            ["eval/episode_return", "rollout/episode_return"],
+        ],
+        "episode length [steps]": ["Multiline", ["eval/episode_length", "rollout/episode_length"]],
+    },
+    "success": {
+        name: chart for name, chart in _LAYOUT["success"].items() if name.startswith("success")
+    },
+}
+"""Those of a run with an `environment`, which may tell no success."""
+
 
 class TensorBoardSink:
     """A sink that writes TensorBoard event files without TensorFlow.
 
     With a configuration, the file also holds its YAML as text, its settings as hyperparameters
-    beside the last success rate, and charts with success first. Videos are GIFs among the images.
+    beside the last success rate or return, and charts with that first. Videos are GIFs among the images.
     """
 
     def __init__(
@@ -260,11 +280,13 @@ class TensorBoardSink:
             for key, value in config.flat().items()
         }
         # The table of hyperparameters shows the last value of this metric.
-        *begin, self._at_end = tensorboard_summary.hparams(settings, {"eval/success_rate": 0.0})
+        own = config.environment is not None
+        metric = "eval/episode_return" if own else "eval/success_rate"
+        *begin, self._at_end = tensorboard_summary.hparams(settings, {metric: 0.0})
         # Markdown shows lines that are indented as they are.
         indented = "".join(f"    {line}\n" for line in config.to_yaml().splitlines())
         begin += [
-            tensorboard_summary.custom_scalars(_LAYOUT),
+            tensorboard_summary.custom_scalars(_RETURN_LAYOUT if own else _LAYOUT),
             tensorboard_summary.text("config", indented),
         ]
         for summary in begin:

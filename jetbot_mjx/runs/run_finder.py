@@ -40,13 +40,15 @@ class RunInfo(NamedTuple):
 
     path: Path
     task: str
-    """Name of the task, with the robot's preset and the observation."""
+    """Name of the task, with the robot's preset and the observation; or of the environment."""
     env_steps: int
     """Environment steps of the last line of its log."""
     num_timesteps: int
     """Environment steps it was asked to train for."""
     success_rate: float | None
-    """Success rate of the best evaluation; None before the first one."""
+    """Success rate of the best evaluation; None before the first one, or if none is told."""
+    episode_return: float | None
+    """Mean return of the best evaluation in an `environment`; None for a robot."""
     changed: float
     """Time of the last line of its log [s since 1970]."""
 
@@ -152,13 +154,16 @@ def read_info(run_dir: Path) -> RunInfo:
     except (UserError, OSError) as error:
         raise DamagedRunError(run_dir, str(error)) from None
     rates = [line.metrics.get("eval/success_rate") for line in history]
-    task = config.task
+    returns = [line.metrics.get("eval/episode_return") for line in history]
+    task = f"{clipped(config.task.name, 60)} {config.robot.label} {config.task.observation}"
+    own = config.environment
     return RunInfo(
         path=run_dir,
-        task=f"{clipped(task.name, 60)} {config.robot.label} {task.observation}",
+        task=task if own is None else clipped(own, 60),
         env_steps=history[-1].env_steps if history else 0,
         num_timesteps=config.ppo.num_timesteps,
         success_rate=max((x for x in rates if x is not None and 0 <= x <= 1), default=None),
+        episode_return=max((x for x in returns if x is not None), default=None) if own else None,
         changed=changed,
     )
 
@@ -176,7 +181,7 @@ def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRunError] = ())
             run.name,
             run.task,
             f"{run.env_steps:,}" + (" *" if run.env_steps < run.num_timesteps else ""),
-            "-" if run.success_rate is None else f"{run.success_rate:.1%}",
+            _score(run),
             _age(time.time() - run.changed),
         )
         for run in runs
@@ -185,9 +190,16 @@ def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRunError] = ())
     if not runs:
         lines = ["no runs here: train one, or use one that comes with the package: pretrained:NAME"]
     if any(run.env_steps < run.num_timesteps for run in runs):
-        lines.append("* stopped before its last step, or reached stop_at_success")
+        lines.append("* stopped before its last step, or reached stop_at_success or stop_at_return")
     lines += [printable(f"damaged: {_shortest_name(one.run_dir)}: {one.reason}") for one in damaged]
     return "\n".join(lines)
+
+
+def _score(run: RunInfo) -> str:
+    """Return the success rate of a run, or its return where it has none."""
+    if run.success_rate is not None:
+        return f"{run.success_rate:.1%}"
+    return "-" if run.episode_return is None else f"return {run.episode_return:.1f}"
 
 
 def copy_pretrained(folder: Path) -> tuple[Path, ...]:

@@ -89,8 +89,9 @@ class WandbSink:
     def _begin(self, config: Config, run_dir: Path, seeds: int) -> _Run:
         wandb = importlib.import_module("wandb")
         group = run_dir.parent.name if seeds > 1 else None
-        task = config.task.name.rpartition(":")[2]
-        tags = (task, config.task.observation, config.robot.label, config.trainer)
+        tags = [config.code.rpartition(":")[2], config.trainer]
+        if config.environment is None:
+            tags[1:1] = config.task.observation, config.robot.label
         run = wandb.init(
             project=config.wandb,
             id=self._progress["id"],
@@ -110,8 +111,10 @@ class WandbSink:
                 finish_timeout_raises=True,
             ),
         )
-        # The table of runs shows the best and the last success rate beside the configuration.
+        # The table of runs shows the best and the last one beside the configuration.
         run.define_metric("eval/success_rate", summary="max,last")
+        if config.environment is not None:
+            run.define_metric("eval/episode_return", summary="max,last")
         where = f"offline; later: wandb sync {Path(run.dir).parent}" if run.offline else run.url
         self._say(f"Weights & Biases: {where or 'disabled'}")
         return run

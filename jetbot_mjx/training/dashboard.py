@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TextIO
+from typing import Literal, TextIO
 
 import jax
 from rich.columns import Columns
@@ -38,7 +38,7 @@ _BLOCKS = "▁▂▃▄▅▆▇█"
 _MAX_ROWS = 8
 _MAX_WIDTH = 100
 _MIN_CURVE, _MIN_BAR = 8, 8
-_DROPPED = ("return", "p95", "", "best", "exploring", "to goal")
+_DROPPED = ("length", "return", "p95", "", "best", "exploring", "to goal")
 """Columns of the table of seeds that a narrow terminal leaves out, the first of them first; the
 curve has no name."""
 _UPDATE = {
@@ -63,8 +63,14 @@ def sparkline(rates: Sequence[float], width: int) -> str:
     return "".join(_BLOCKS[min(int(rate * len(_BLOCKS)), len(_BLOCKS) - 1)] for rate in rates)
 
 
+def scaled(values: Sequence[float]) -> list[float]:
+    """Return a curve of values, such as returns, as rates from 0 at the lowest to 1."""
+    low, high = min(values, default=0.0), max(values, default=0.0)
+    return [(value - low) / (high - low) if high > low else 0.0 for value in values]
+
+
 class Dashboard(Terminal):
-    """A `Dashboard` shows success, speed and phases in place; messages scroll above it."""
+    """A `Dashboard` shows scores, speed and phases in place; messages scroll above it."""
 
     def __init__(
         self,
@@ -85,7 +91,9 @@ class Dashboard(Terminal):
         """
         super().__init__(total_steps)
         self._title, self._seeds, self._console = title, seeds, console
-        self._rates: list[list[float]] = [[] for _ in seeds]
+        self._scores: list[list[float]] = [[] for _ in seeds]
+        self._scored_by: Literal["success", "return"] = "success"
+        self._is_own = False
         self._metrics: Sequence[MetricValues] = [{} for _ in seeds]
         self._mean: MetricValues = {}
         self._nonfinite = 0.0
@@ -232,9 +240,14 @@ class Dashboard(Terminal):
 
     def _add(self, metrics: Sequence[MetricValues]) -> None:
         self._metrics, self._mean = metrics, mean_of(metrics)
-        for rates, one in zip(self._rates, metrics, strict=True):
-            if (rate := one.get("eval/success_rate")) is not None:
-                rates.append(rate)
+        # Only an environment of one's own has an interval of the return.
+        self._is_own = "eval/return_low" in self._mean
+        told = not self._is_own or self._mean.get("eval/success_rate") is not None
+        self._scored_by = "success" if told else "return"
+        key = "eval/success_rate" if told else "eval/episode_return"
+        for scores, one in zip(self._scores, metrics, strict=True):
+            if (score := one.get(key)) is not None:
+                scores.append(score)
             for name in ("train/nonfinite_envs", "train/nonfinite_updates"):
                 self._nonfinite += one.get(name) or 0.0
 
@@ -306,21 +319,7 @@ class Dashboard(Terminal):
         return Columns(texts, padding=(0, 3)) if texts else "-"
 
     def _table(self) -> "_FirstThatFits":
-        cells = [
-            {
-                "seed": name,
-                "success": Text(
-                    _formatted(metrics.get("eval/success_rate"), "{:.1%}"), "bold green"
-                ),
-                "": _Curve(rates),
-                "best": _formatted(max(rates, default=None), "{:.1%}"),
-                "exploring": _formatted(metrics.get("rollout/success_rate"), "{:.1%}"),
-                "return": _formatted(metrics.get("eval/episode_return"), "{:.2f}"),
-                "to goal": _formatted(metrics.get("eval/time_to_goal_median"), "{:.2f} s"),
-                "p95": _formatted(metrics.get("eval/time_to_goal_p95"), "{:.2f} s"),
-            }
-            for name, rates, metrics in self._rows()
-        ]
+        cells = [{"seed": name} | self._cells(*row) for name, *row in self._rows()]
         names = [name for name in cells[0] if name != "seed" or len(self._seeds) > 1]
         tables = []
         for count in range(len(_DROPPED) + 1):
@@ -335,12 +334,36 @@ class Dashboard(Terminal):
             tables.append(table)
         return _FirstThatFits(*tables)
 
+    def _cells(
+        self, scores: Sequence[float], metrics: MetricValues
+    ) -> "dict[str, str | Text | _Curve]":
+        """Return what a row of the table shows, by the name of the column."""
+        what, key = "success", "success_rate"
+        form, curve = "{:.1%}", scores
+        if self._scored_by == "return":
+            what, key = "return", "episode_return"
+            form, curve = "{:.2f}", scaled(scores)
+        cells = {
+            what: Text(_formatted(metrics.get(f"eval/{key}"), form), "bold green"),
+            "": _Curve(curve),
+            "best": _formatted(max(scores, default=None), form),
+            "exploring": _formatted(metrics.get(f"rollout/{key}"), form),
+        }
+        if what == "success":
+            cells["return"] = _formatted(metrics.get("eval/episode_return"), "{:.2f}")
+        if self._is_own:
+            return cells | {"length": _formatted(metrics.get("eval/episode_length"), "{:.1f}")}
+        return cells | {
+            "to goal": _formatted(metrics.get("eval/time_to_goal_median"), "{:.2f} s"),
+            "p95": _formatted(metrics.get("eval/time_to_goal_p95"), "{:.2f} s"),
+        }
+
     def _rows(self) -> list[tuple[str, Sequence[float], MetricValues]]:
-        """Return name, success rates and metrics of each seed, or of many seeds their range."""
+        """Return name, scores and metrics of each seed, or of many seeds their range."""
         if len(self._seeds) == 1:
-            return [("", self._rates[0], self._mean)]
+            return [("", self._scores[0], self._mean)]
         if len(self._seeds) <= _MAX_ROWS:
-            return list(zip(self._seeds, self._rates, self._metrics, strict=True))
+            return list(zip(self._seeds, self._scores, self._metrics, strict=True))
         rows = []
         for name, of in (("mean", statistics.fmean), ("lowest", min), ("highest", max)):
             values = {
@@ -348,7 +371,7 @@ class Dashboard(Terminal):
                 for key in self._metrics[0]
             }
             metrics = {key: of(found) for key, found in values.items() if found}
-            rows.append((name, [of(rates) for rates in zip(*self._rates, strict=False)], metrics))
+            rows.append((name, [of(one) for one in zip(*self._scores, strict=False)], metrics))
         return rows
 
 

@@ -61,6 +61,8 @@ class Result(NamedTuple):
     """Whether the training came to its end; otherwise the same command resumes it."""
     wall_seconds: float
     """Time spent on the training, in all processes [s]."""
+    next_commands: Sequence[str] = ("evaluate", "render", "play")
+    """Commands for its policies, the first of which takes several seeds."""
 
     def __repr__(self) -> str:
         """Return the folder and the best evaluation of each seed in one line."""
@@ -489,7 +491,11 @@ def _result(training: Training, recorder: RunRecorder | None, *, finished: bool)
     if recorder is None:
         return Result(*folders, [], [], finished, 0.0)
     fingerprints = [seed.fingerprint for seed in recorder.seeds]
-    return Result(*folders, recorder.standings, fingerprints, finished, recorder.wall_seconds)
+    done = Result(*folders, recorder.standings, fingerprints, finished, recorder.wall_seconds)
+    env = training.setup.env
+    if not isinstance(env, AdaptedEnv):
+        return done
+    return done._replace(next_commands=["evaluate", "export"] + ["render"] * bool(env.mj_model))
 
 
 def _complete_message(config: Config, standings: Sequence[Standing]) -> str:
@@ -571,9 +577,8 @@ def summary(result: Result) -> str:
     first = shlex.quote(str(result.run_dirs[0]))
     lines += [
         f"total {result.wall_seconds:.1f} s",
-        f"next: jetbot-mjx evaluate {shlex.quote(str(result.run_dir))}",
-        f"      jetbot-mjx render {first}",
-        f"      jetbot-mjx play {first}",
+        f"next: jetbot-mjx {result.next_commands[0]} {shlex.quote(str(result.run_dir))}",
+        *(f"      jetbot-mjx {command} {first}" for command in result.next_commands[1:]),
     ]
     if importlib.util.find_spec("tensorboard") is not None:
         # TensorBoard names runs by their folder below this one.

@@ -10,9 +10,14 @@ import numpy as np
 from PIL import Image
 
 from jetbot_mjx import evaluation, runs
-from jetbot_mjx.envs import JetBotEnv
+from jetbot_mjx.envs import AdaptedEnv, JetBotEnv
 from jetbot_mjx.errors import UserError, check_count
 from jetbot_mjx.terminal import Advance, stage
+from jetbot_mjx.viewers.environment_video import (
+    EnvironmentRenderer,
+    require_model,
+    split_motions,
+)
 from jetbot_mjx.viewers.video import (
     GIF_STRIDE,
     Frame,
@@ -25,6 +30,8 @@ from jetbot_mjx.viewers.video import (
 
 VIDEO_EPISODES, GALLERY_EPISODES = 20, 4
 """Default number of goals of the videos of one policy, and of a gallery."""
+
+_ENVIRONMENT_EPISODES = 3  # default in an environment of one's own, whose episodes are longer
 
 _GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
 _GIF_SIZE, _GALLERY_GIF_SIZE = 0.6, 0.75  # relative to the video
@@ -67,15 +74,18 @@ def video_files(folder: Path, name: str) -> dict[str, Path]:
 def render_run(
     run_or_checkpoint: str | Path,
     *,
-    episodes: int = VIDEO_EPISODES,
+    episodes: int | None = None,
     goals: Sequence[int] | None = None,
     which: runs.Which = "best",
 ) -> Rendered:
     """Render deterministic episodes of one policy on some of the report's fixed goals.
 
+    In an environment of one's own they begin with the report's fixed starts.
+
     Args:
       run_or_checkpoint: A run folder, or one of its checkpoint folders.
-      episodes: The number of goals, from the first on.
+      episodes: The number of goals, from the first on; None: `VIDEO_EPISODES`, and 3 in an
+        environment of one's own.
       goals: Indices of the goals in the order of the video, which replace `episodes`, or None.
       which: The checkpoint of a run folder.
 
@@ -84,11 +94,22 @@ def render_run(
       indices; with another number of episodes than by default, that number.
 
     Raises:
-      UserError: there is no usable checkpoint, no such goal, no OpenGL, or no space on the disk.
+      UserError: there is no usable checkpoint, no such goal, no OpenGL, no space on the disk, or
+        the environment has no goals, or no model of MuJoCo.
     """
     # Choose the goals and the names of the files.
-    if goals is None:
+    if episodes is not None:
         check_count("episodes", episodes, evaluation.REPORT_GOALS)
+    checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
+    if checkpoint.config.environment is not None:
+        if goals is not None:
+            raise UserError(
+                f"--goals is for robots, and the run has environment ="
+                f" {checkpoint.config.environment!r}: give --episodes"
+            )
+        return _render_environment(checkpoint, episodes or _ENVIRONMENT_EPISODES)
+    if goals is None:
+        episodes = episodes or VIDEO_EPISODES
         goals = range(episodes)
         names = [
             evaluation.name_with_count(name, episodes, VIDEO_EPISODES)
@@ -98,7 +119,6 @@ def render_run(
         evaluation.check_goals(goals)
         names = (f"goals-{evaluation.format_goals(goals)}",) * 2
     # Run the episodes.
-    checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
     setup = checkpoint.make_setup()
     env = setup.robot_env
     rolled_out = run_episodes([checkpoint], setup, goals)[0]
@@ -114,6 +134,28 @@ def render_run(
         _write_videos(files, videos, total, _GIF_SIZE)
     successes = {checkpoint.env_steps: int(rolled_out.success.sum())}
     return Rendered(successes, len(goals), files)
+
+
+def _render_environment(checkpoint: runs.Checkpoint, episodes: int) -> Rendered:
+    """Render a policy from the report's first starts, in an environment of one's own."""
+    setup = checkpoint.make_setup()
+    env = setup.env
+    assert isinstance(env, AdaptedEnv)
+    require_model(env)
+    evaluator = evaluation.ReturnEvaluator(env, setup.networks, setup.programs, record=True)
+    found = jax.device_get(evaluator.run(checkpoint.params, evaluation.report_keys(episodes)))
+    summary = evaluation.summarize_returns(found, has_success=env.has_success)
+    motions = split_motions(env, found)
+    name = evaluation.name_with_count("episodes", episodes, _ENVIRONMENT_EPISODES)
+    files = video_files(checkpoint.results_dir / "videos" / checkpoint.path.name, name)
+    with EnvironmentRenderer(env) as renderer:
+        total = sum(renderer.frame_count(one) for one in motions)
+        _write_videos(files, [renderer.render_episode(one) for one in motions], total, _GIF_SIZE)
+    note = (
+        f"{checkpoint.env_steps:>12,} steps  return {summary.episode_return:.1f} in the mean of"
+        f" {episodes:,} episodes"
+    )
+    return Rendered({}, episodes, files, note)
 
 
 def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> Rendered:

@@ -73,6 +73,8 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
           The image, RGB.
         """
         set_pose(self._model, self._data, qpos, markers)
+        # Cameras may follow a centre of mass.
+        mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, camera=camera)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows

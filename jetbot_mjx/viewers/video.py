@@ -35,7 +35,9 @@ FPS = 25
 GIF_STRIDE = 2
 """Frames of a video per frame of a GIF, whose frame times are multiples of 10 ms."""
 
-_HOLD_SECONDS = 0.6  # pause after the end, so that the viewer sees it
+HOLD_SECONDS = 0.6
+"""Pause after the end, so that the viewer sees it [s]."""
+
 # Lengths as fractions of the view's side.
 _INSET = (0.30, 0.225)  # width and height of the onboard camera's image
 _SEEN, _SEEN_OF_MANY = 0.32, 0.24  # longer side of what a policy sees, alone and side by side
@@ -198,7 +200,7 @@ class VideoRenderer(contextlib.ExitStack):
     def frame_count(self, trajectories: Sequence[Trajectory]) -> int:
         """Return the number of frames of a video of one trajectory, or of several side by side."""
         longest = max(trajectory.steps * trajectory.dt for trajectory in trajectories)
-        return math.ceil(longest * self._fps) + round(_HOLD_SECONDS * self._fps) + 1
+        return math.ceil(longest * self._fps) + round(HOLD_SECONDS * self._fps) + 1
 
     def _view_frame(
         self,
@@ -276,17 +278,31 @@ class VideoRenderer(contextlib.ExitStack):
             lines.append(
                 ("reached", "darkgreen") if trajectory.reached else ("missed", "firebrick")
             )
-        image = Image.fromarray(frame)
-        draw = ImageDraw.Draw(image)
-        size, margin = _TEXT * self._side, round(_MARGIN * self._side)
-        for row, (text, colour) in enumerate(lines):
-            position = (beside + margin, margin + row * 1.15 * size)
-            # The white outline makes text readable on any background, but narrows the spaces.
-            spaced = text.replace(" ", "  ")
-            draw.text(
-                position, spaced, colour, _font(size), stroke_width=size / 10, stroke_fill="white"
-            )
-        return np.asarray(image)
+        margin = round(_MARGIN * self._side)
+        return with_lines(frame, lines, _TEXT * self._side, (beside + margin, margin))
+
+
+def with_lines(
+    frame: Frame, lines: Sequence[tuple[str, str]], size: float, corner: tuple[float, float]
+) -> Frame:
+    """Write lines of text into a frame.
+
+    Args:
+      frame: the frame, which is not modified.
+      lines: each line with the name of its colour.
+      size: the height of the font [pixels].
+      corner: column and row at which the first line begins.
+    """
+    image = Image.fromarray(frame)
+    draw = ImageDraw.Draw(image)
+    for row, (text, colour) in enumerate(lines):
+        position = (corner[0], corner[1] + row * 1.15 * size)
+        # The white outline makes text readable on any background, but narrows the spaces.
+        spaced = text.replace(" ", "  ")
+        draw.text(
+            position, spaced, colour, _font(size), stroke_width=size / 10, stroke_fill="white"
+        )
+    return np.asarray(image)
 
 
 @functools.cache

@@ -5,6 +5,7 @@ import functools
 import json
 import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -15,8 +16,9 @@ import numpy as np
 import pytest
 
 import jetbot_mjx
+from helpers import point_mass
 from helpers.bare_python import NUMPY, alone, site_with
-from jetbot_mjx import export
+from jetbot_mjx import export, training
 from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.deployment import export_policy, exporters, numpy_policy, policy_export
@@ -587,3 +589,57 @@ def test_a_shorter_recording_is_the_beginning_of_a_longer_one(exported, run_dir)
 def test_the_formats_and_the_folder_are_those_of_the_exporters():
     assert tuple(FORMATS) == export._FORMATS
     assert export._FOLDER == policy_export.FOLDER
+
+
+# Policies of an environment of one's own.
+
+
+@pytest.fixture(scope="module", params=["PointMass", "Choosing"])
+def own(request, tmp_path_factory):
+    """A run in an environment of one's own, and its export."""
+    run_dir = tmp_path_factory.mktemp("own") / "run"
+    training.run(point_mass.config(request.param), run_dir)
+    assert export.main([str(run_dir), "--format", "all"]) == 0
+    return run_dir, run_dir / "policy"
+
+
+def test_a_policy_of_an_environment_is_exported_with_its_contract(own):
+    _, folder = own
+    spec = json.loads((folder / "policy.json").read_text())
+    choosing = spec["environment"].endswith("Choosing")
+    assert spec["inputs"] == [{"name": "obs", "dtype": "float32", "shape": [2]}]
+    assert [one["name"] for one in spec["action"]] == (
+        ["choice_0", "choice_1", "choice_2"] if choosing else ["action_0"]
+    )
+    assert spec["control_period"] == (None if choosing else point_mass.DT)
+    assert spec["network"]["squash"] == (None if choosing else "tanh")
+    assert set(spec["files"]) == {*FORMATS}
+    assert all(one["largest_difference"] < TOLERANCE for one in spec["files"].values())
+    assert 9_900 < spec["recording"]["observations"] <= 10_000
+    assert "wheel_speeds" not in spec
+
+
+def test_an_exported_policy_of_an_environment_acts_as_the_run_does(own):
+    run_dir, folder = own
+    obs = np.random.default_rng(0).uniform(-1, 1, (200, 2)).astype(np.float32)
+    action = np.asarray(jetbot_mjx.load_policy(run_dir)(obs))
+    assert np.abs(np.asarray(jetbot_mjx.load_policy(folder)(obs)) - action).max() < TOLERANCE
+    (onnx,) = FORMATS["onnx"].read(folder / "policy.onnx")(obs)
+    assert np.abs(onnx - action).max() < TOLERANCE
+    if action.shape[1] == 3:
+        assert set(np.unique(action)) == {0.0, 1.0}
+        assert (action.sum(axis=1) == 1).all()
+    with pytest.raises(InvalidError, match="not 2 numbers"):
+        jetbot_mjx.load_policy(folder)(np.zeros(3))
+
+
+def test_the_file_of_an_environments_policy_checks_itself(own):
+    _, folder = own
+    done = subprocess.run([sys.executable, "policy.py"], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "from JAX; a call takes" in done.stdout
+
+
+def test_a_page_is_for_robots(own):
+    with pytest.raises(UserError, match="has no robot that drives to a goal: this is for policies"):
+        export.main([str(own[0]), "--format", "web"])

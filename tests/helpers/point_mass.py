@@ -78,6 +78,11 @@ class Choosing(PointMass):
         return jnp.array([-1.0, 1.0, 0.0])[jnp.argmax(action)][None]
 
 
+class Posed(struct.PyTreeNode):
+    qpos: jax.Array
+    qvel: jax.Array
+
+
 class Shown(PointMass):
     """The same, with a model of MuJoCo for pictures."""
 
@@ -86,10 +91,10 @@ class Shown(PointMass):
         self.mj_model = mujoco.MjModel.from_xml_string(MJCF)
 
     def moving(self, place, speed):
-        return {"qpos": place, "qvel": speed}
+        return Posed(place, speed)
 
     def read(self, moving):
-        return moving["qpos"], moving["qvel"]
+        return moving.qpos, moving.qvel
 
 
 TINY = {

@@ -240,6 +240,22 @@ def test_tensorboard_tells_the_configuration_and_shows_success_first(tmp_path):
     assert len(scalars) == len(set(scalars))
 
 
+def test_tensorboard_shows_the_return_of_an_environment(tmp_path):
+    config = parse_config({"environment": "hopper:Hopper"})
+    folder = tmp_path / "tensorboard"
+    TensorBoardSink(folder, [], config).close()
+    values = {value.tag: value for event in events(folder) for value in event.summary.value}
+    layout = Layout.FromString(values["custom_scalars__config__"].tensor.string_val[0])
+    assert [category.title for category in layout.category] == ["return", "success"]
+    margin = layout.category[0].chart[0].margin.series[0]
+    assert (margin.value, margin.lower) == ("eval/episode_return", "eval/return_low")
+    experiment = HParamsPluginData.FromString(
+        values["_hparams_/experiment"].metadata.plugin_data.content
+    )
+    (metric,) = experiment.experiment.metric_infos
+    assert metric.name.tag == "eval/episode_return"
+
+
 def film(run_dir, steps):
     path = run_dir / "videos" / f"{steps:012}" / metrics.EVALUATION_VIDEO
     path.parent.mkdir(parents=True)

@@ -200,3 +200,22 @@ def test_no_name_can_command_the_terminal(runs, capsys):
 
 
 
+
+
+def test_a_run_in_an_environment_shows_its_name_and_return(runs):
+    run = make_run(runs / "runs/own", environment="hopper:Hopper")
+    lines = [
+        {"env_steps": 1000 * i, "timestamp": 60.0 + i, "eval/episode_return": value}
+        for i, value in enumerate((-5.0, 812.5, 700.0))
+    ]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    info = read_info(run)
+    assert (info.task, info.success_rate, info.episode_return) == ("hopper:Hopper", None, 812.5)
+    assert re.search(r"own +hopper:Hopper +2,000 \* +return 812\.5", runs_table([info]))
+    # Of a robot, which has a success rate, the return is not told.
+    assert read_info(runs / "runs/newer").episode_return is None
+    # Where the environment tells successes, they are.
+    with (run / "metrics.jsonl").open("a") as file:
+        line = {"env_steps": 3000, "timestamp": 70.0, "eval/success_rate": 0.25}
+        file.write(json.dumps(line) + "\n")
+    assert "25.0%" in runs_table([read_info(run)])

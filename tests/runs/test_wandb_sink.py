@@ -99,6 +99,13 @@ def test_a_run_gets_its_configuration_and_every_metric(wandb, track):
     assert track.said == ["Weights & Biases: https://example.com/run"]
 
 
+def test_a_run_in_an_environment_is_known_by_its_name_and_return(wandb, track):
+    track(config=parse_config({"wandb": "jetbots", "environment": "hopper:Hopper"})).close()
+    (run,) = wandb.runs
+    assert run.arguments["tags"] == ["Hopper", "resumable"]
+    assert run.defined["eval/episode_return"] == {"summary": "max,last"}
+
+
 def test_a_resumed_training_logs_to_the_same_run_and_no_step_twice(wandb, track):
     first = track()
     for step in (0, 10, 20):

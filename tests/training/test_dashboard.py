@@ -17,7 +17,7 @@ from jetbot_mjx.runs.metrics import History, read_history
 from jetbot_mjx.terminal import restart_clock
 from jetbot_mjx.training import dashboard as dashboard_module
 from jetbot_mjx.training.console import Terminal
-from jetbot_mjx.training.dashboard import Dashboard, sparkline
+from jetbot_mjx.training.dashboard import Dashboard, scaled, sparkline
 from jetbot_mjx.training.terminal import open_terminal
 
 REPORT = {
@@ -471,3 +471,44 @@ def test_a_curve_is_the_whole_history_in_so_many_blocks():
     assert sparkline([0.0, 0.13, 0.5, 0.99, 1.0], 8) == "▁▂▅██"
     assert sparkline([0.0] * 500 + [1.0] * 500, 8) == "▁▁▁▁████"
     assert sparkline([], 8) == ""
+
+
+def test_a_curve_of_returns_goes_from_the_lowest_to_the_highest():
+    assert scaled([-100.0, 0.0, 100.0]) == [0.0, 0.5, 1.0]
+    assert scaled([7.0, 7.0]) == [0.0, 0.0]
+    assert scaled([]) == []
+
+
+RETURN = {
+    "eval/episode_return": 12.25,
+    "eval/return_low": 11.0,
+    "eval/episode_length": 15.5,
+    "eval/success_rate": None,
+    "rollout/episode_return": 3.5,
+    "rollout/success_rate": None,
+}
+
+
+def test_without_successes_the_return_and_its_curve_are_shown(screen, opened):
+    dashboard = opened()
+    dashboard.begin()
+    dashboard.write(0, [{**RETURN, "eval/episode_return": -4.0}])
+    dashboard.write(2_500, [RETURN])
+    dashboard.close()
+    screen.until("╯")
+    end = on_screen(screen.text)
+    assert re.search(r"return +best +exploring +length", end)
+    assert re.search(r"12\.25  ▁█ +12\.25 +3\.50 +15\.5", end)
+    assert "success" not in end
+    assert "to goal" not in end
+
+
+def test_with_successes_they_come_first_in_an_environment_too(screen, opened):
+    dashboard = opened()
+    dashboard.begin()
+    dashboard.write(2_500, [{**RETURN, "eval/success_rate": 0.5}])
+    dashboard.close()
+    screen.until("╯")
+    end = on_screen(screen.text)
+    assert re.search(r"success +best +exploring +return +length", end)
+    assert re.search(r"50\.0%  ▅ +50\.0% +- +12\.25 +15\.5", end)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from helpers import point_mass
+from jetbot_mjx import training
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.training import session
 
@@ -34,3 +36,13 @@ def test_the_next_commands_can_be_copied_where_the_folder_has_blanks():
     result = session.Result(mine, [mine], [standing], ["abc"], finished=True, wall_seconds=1.0)
     commands = session.summary(result).partition("next:")[2].splitlines()
     assert [shlex.split(line)[-1] for line in commands[:3]] == ["my runs/mine"] * 3
+
+
+@pytest.mark.parametrize(
+    ("name", "commands"),
+    [("PointMass", ["evaluate", "export"]), ("Shown", ["evaluate", "export", "render"])],
+)
+def test_an_environment_gets_the_commands_that_work_for_it(name, commands, tmp_path):
+    result = training.run(point_mass.config(name), tmp_path / "mine")
+    lines = session.summary(result).partition("next:")[2].splitlines()
+    assert [line.split()[1] for line in lines if "jetbot-mjx" in line] == commands
