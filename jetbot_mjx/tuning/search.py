@@ -258,11 +258,11 @@ class Search:
                     for i, result in zip(part, results, strict=True):
                         done[work[i][0]].append(result)
                     advance(len(part))
-        scored_by = study_score(self.study)
-        return [
-            Entrant(name, dict(chosen[name]), *zip(*found, strict=True), scored_by=scored_by)
-            for name, found in done.items()
-        ]
+        scored_by, entrants = study_score(self.study), []
+        for name, found in done.items():
+            areas, scores, seconds = zip(*found, strict=True)
+            entrants.append(Entrant(name, dict(chosen[name]), areas, scores, seconds, scored_by))
+        return entrants
 
     def values_of(self, trial: FrozenTrial) -> dict[str, Value]:
         """Return the values of a trial that is stored."""

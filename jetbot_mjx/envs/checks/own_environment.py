@@ -7,6 +7,7 @@ A training would run for minutes on a reward that is not a number, or with a sta
 import functools
 import time
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
