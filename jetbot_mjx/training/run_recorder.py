@@ -23,7 +23,7 @@ from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.console import Phase, Terminal
 
 if TYPE_CHECKING:
-    from jetbot_mjx.viewers import EvaluationVideo
+    from jetbot_mjx.viewers import EnvironmentVideo, EvaluationVideo
 
 
 @dataclasses.dataclass
@@ -114,7 +114,7 @@ class RunRecorder(TrainerCallback, contextlib.AbstractContextManager["RunRecorde
     config: Config
     seeds: Sequence["SeedRecorder"]
     evaluate: Callable[[PolicyParams], Summary | ReturnSummary]
-    video: "EvaluationVideo | None"
+    video: "EvaluationVideo | EnvironmentVideo | None"
     terminal: Terminal
     say: Callable[[str], None]
     clock: runs.CompileClock
@@ -368,7 +368,7 @@ class SeedRecorder:
         joined = trees.keys() - {runs.POLICY}
         self._store.save(progress.env_steps, trees, about, score, joined)
 
-    def render(self, video: "EvaluationVideo", progress: Progress) -> None:
+    def render(self, video: "EvaluationVideo | EnvironmentVideo", progress: Progress) -> None:
         """Render a video of the policy into the run folder, and log it."""
         name = runs.checkpoint_path(self.run_dir, progress.env_steps).name
         path = self.run_dir / "videos" / name / runs.EVALUATION_VIDEO

@@ -234,11 +234,16 @@ def _has_checkpoints(run_dirs: Sequence[Path]) -> bool:
 
 
 def _check_targets(config: Config, env: AdaptedEnv) -> None:
-    """Raise an error if a training could never end as it is told to."""
+    """Raise an error if a training cannot end, or show itself, as it is told to."""
     if config.stop_at_success is not None and not env.has_success:
         raise UserError(
             f"stop_at_success = {config.stop_at_success}: environment = {config.environment!r} has"
             " no metric 'success': use stop_at_return, or leave it out"
+        )
+    if config.evaluation.video and env.mj_model is None:
+        raise UserError(
+            f"evaluation.video = {config.evaluation.video!r}: environment = {config.environment!r}"
+            " has no `mj_model`, or its state no `qpos`: leave it out"
         )
 
 
@@ -360,9 +365,10 @@ def open_recorder(
     video = None
     if config.evaluation.video:
         # Only here, because it imports libraries for images that no other training needs.
-        from jetbot_mjx.viewers import EvaluationVideo
+        from jetbot_mjx.viewers import EnvironmentVideo, EvaluationVideo
 
-        video = EvaluationVideo(training.setup)
+        is_own = isinstance(training.setup.env, AdaptedEnv)
+        video = (EnvironmentVideo if is_own else EvaluationVideo)(training.setup)
     # Open the terminal and the logs where the stored run ends.
     resumed = resumption or Resumption(0, [], [{} for _ in run_dirs], [])
     histories = [

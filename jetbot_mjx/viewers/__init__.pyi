@@ -1,3 +1,4 @@
+from .environment_video import EnvironmentVideo as EnvironmentVideo
 from .gallery import GALLERY_EPISODES as GALLERY_EPISODES
 from .gallery import Rendered as Rendered
 from .gallery import render_gallery as render_gallery

@@ -3,6 +3,7 @@
 import contextlib
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -10,15 +11,25 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from jetbot_mjx.agents import PolicyParams
 from jetbot_mjx.envs import AdaptedEnv
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import ReturnEpisodes
+from jetbot_mjx.evaluation import ReturnEpisodes, ReturnEvaluator, report_keys
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.viewers.offscreen import Renderer
-from jetbot_mjx.viewers.video import FPS, HOLD_SECONDS, Frame, with_lines
+from jetbot_mjx.viewers.video import (
+    FPS,
+    GIF_STRIDE,
+    HOLD_SECONDS,
+    Frame,
+    with_lines,
+    write_gif,
+    write_mp4,
+)
 
-_WIDTH, _HEIGHT = 640, 480  # [pixels]
+_HEIGHT, _ASPECT = 480, 4 / 3  # [pixels] height, and width over height
 _DISTANCE = 1.5  # of a camera that follows, in the model's extents
-_TEXT, _MARGIN = 20, 12  # [pixels]
+_TEXT, _MARGIN = 20 / 480, 12 / 480  # of the height
 
 
 class Motion(NamedTuple):
@@ -72,11 +83,13 @@ class EnvironmentRenderer(contextlib.ExitStack):
     The view is that of the model's first camera, or of one that follows the first body.
     """
 
-    def __init__(self, env: AdaptedEnv) -> None:
+    def __init__(self, env: AdaptedEnv, height: int = _HEIGHT, fps: float = FPS) -> None:
         """Open the renderer.
 
         Args:
           env: the environment of the motions.
+          height: the height of a frame [pixels].
+          fps: frames per second.
 
         Raises:
           UserError: it has no model, or this machine has no OpenGL that works without a display.
@@ -85,12 +98,14 @@ class EnvironmentRenderer(contextlib.ExitStack):
         model = require_model(env)
         self._dt = env.dt or float(model.opt.timestep)
         self._camera = view_of(model)
-        self._view = self.enter_context(Renderer(model, width=_WIDTH, height=_HEIGHT))
+        self._height, self._fps = height, fps
+        width = round(_ASPECT * height)
+        self._view = self.enter_context(Renderer(model, width=width, height=height))
 
     def frame_count(self, motion: Motion) -> int:
         """Return the number of frames of a video of one motion, with a pause at its end."""
         seconds = (len(motion.qpos) - 1) * self._dt
-        return math.ceil(seconds * FPS) + round(HOLD_SECONDS * FPS) + 1
+        return math.ceil(seconds * self._fps) + round(HOLD_SECONDS * self._fps) + 1
 
     def render_episode(self, motion: Motion) -> Iterator[Frame]:
         """Render one motion.
@@ -99,8 +114,9 @@ class EnvironmentRenderer(contextlib.ExitStack):
           motion: the episode.
         """
         last = len(motion.qpos) - 1
+        margin = round(_MARGIN * self._height)
         for frame in range(self.frame_count(motion)):
-            step = min(round(frame / FPS / self._dt), last)
+            step = min(round(frame / self._fps / self._dt), last)
             lines = [(f"start {motion.number}  {step * self._dt:.2f} s", "black")]
             if step == last:
                 lines.append((f"return {motion.episode_return:.1f}", "black"))
@@ -108,7 +124,44 @@ class EnvironmentRenderer(contextlib.ExitStack):
                 told = ("success", "darkgreen") if motion.success else ("no success", "firebrick")
                 lines.append(told)
             image = self._view.frame(motion.qpos[step], {}, self._camera)
-            yield with_lines(image, lines, _TEXT, (_MARGIN, _MARGIN))
+            yield with_lines(image, lines, _TEXT * self._height, (margin, margin))
+
+
+class EnvironmentVideo:
+    """An `EnvironmentVideo` renders policies of a training from the report's first start."""
+
+    _HEIGHT, _FPS = 240, FPS / GIF_STRIDE  # small, so that training waits only briefly
+
+    def __init__(self, setup: Setup) -> None:
+        """Prepare the program, which compiles at its first use.
+
+        Args:
+          setup: the environment, networks and programs of the training.
+
+        Raises:
+          UserError: the environment has no model.
+        """
+        assert isinstance(setup.env, AdaptedEnv)
+        require_model(setup.env)
+        self._env = setup.env
+        self._evaluator = ReturnEvaluator(setup.env, setup.networks, setup.programs, record=True)
+
+    def write(self, path: Path, params: PolicyParams, env_steps: int) -> None:
+        """Run an episode and write its video, and a GIF of the same name.
+
+        Args:
+          path: the path of the mp4 file.
+          params: the parameters of the policy.
+          env_steps: the environment steps that the policy was trained for.
+
+        Raises:
+          UserError: this machine has no OpenGL that works without a display.
+        """
+        (motion,) = split_motions(self._env, self._evaluator.run(params, report_keys(1)))
+        with EnvironmentRenderer(self._env, self._HEIGHT, self._FPS) as renderer:
+            frames = list(renderer.render_episode(motion))
+        write_mp4(path, frames, self._FPS)
+        write_gif(path.with_suffix(".gif"), frames)
 
 
 def view_of(model: mujoco.MjModel) -> mujoco.MjvCamera:

@@ -160,7 +160,7 @@ def _render_environment(
         _write_videos(files, [renderer.render_episode(one) for one in motions], total, _GIF_SIZE)
     note = (
         f"{checkpoint.env_steps:>12,} steps  return {summary.episode_return:.1f} in the mean of"
-        f" {episodes:,} episodes"
+        f" {episodes:,} episode{'s' if episodes > 1 else ''}"
     )
     return Rendered({}, episodes, files, note)
 

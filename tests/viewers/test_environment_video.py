@@ -20,20 +20,36 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_episodes_are_rendered_in_real_time(folder):
-    rendered = library.render(folder, episodes=2)
+def test_episodes_are_rendered_in_real_time(folder, with_opengl):
+    rendered = library.render(folder, episodes=1)
     assert {name: path.name for name, path in rendered.files.items()} == {
-        "video": "episodes-2.mp4",
-        "gif": "episodes-2.gif",
+        "video": "episodes-1.mp4",
+        "gif": "episodes-1.gif",
     }
-    assert rendered.describe().splitlines()[0].endswith("in the mean of 2 episodes")
+    assert rendered.describe().splitlines()[0].endswith("in the mean of 1 episode")
     frames = iio.imread(rendered.files["video"])
     seconds = 16 * point_mass.DT
-    assert len(frames) == 2 * (round(seconds * FPS) + round(HOLD_SECONDS * FPS) + 1)
+    assert len(frames) == round(seconds * FPS) + round(HOLD_SECONDS * FPS) + 1
     assert frames[0].shape == (480, 640, 3)
     # The point is red, and it is to be seen.
     red = frames[0].astype(int)
     assert ((red[..., 0] > 120) & (red[..., 1] < 70) & (red[..., 2] < 70)).sum() > 200
+
+
+def test_a_training_renders_its_policies(tmp_path, with_opengl):
+    config = point_mass.config("Shown", evaluation={"episodes": 4, "video": "last"})
+    training.run(config, tmp_path / "run")
+    (path,) = (tmp_path / "run" / "videos").rglob("*.mp4")
+    assert path.parts[-2:] == ("000000002048", "evaluation.mp4")
+    assert iio.imread(path)[0].shape == (240, 320, 3)
+    assert path.with_suffix(".gif").is_file()
+
+
+def test_a_training_that_cannot_be_shown_is_refused_before_a_folder_is_made(tmp_path):
+    config = point_mass.config(evaluation={"video": True})
+    with pytest.raises(UserError, match=r"^evaluation.video = True: .* has no `mj_model`"):
+        training.run(config, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_the_view_is_the_first_camera_or_follows_what_moves():
