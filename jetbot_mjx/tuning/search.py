@@ -258,8 +258,9 @@ class Search:
                     for i, result in zip(part, results, strict=True):
                         done[work[i][0]].append(result)
                     advance(len(part))
+        scored_by = study_score(self.study)
         return [
-            Entrant(name, dict(chosen[name]), *zip(*found, strict=True), study_score(self.study))
+            Entrant(name, dict(chosen[name]), *zip(*found, strict=True), scored_by=scored_by)
             for name, found in done.items()
         ]
 
