@@ -73,14 +73,14 @@ def export_policy(
     setup = checkpoint.make_setup()
     env = setup.env
     policy, reference = portable_policy(checkpoint, env), as_jax(checkpoint, env)
-    with runs.writing_to(folder):
-        if folder.exists() and not (folder / FILE).is_file():
-            raise UserError(
-                f"{folder} exists and is not an export: choose a new folder with --output"
-            )
+    _check_folder(folder)
     with runs.atomic_folder(folder) as unfinished:
-        own = isinstance(env, AdaptedEnv)
-        recording = record_environment(checkpoint, setup) if own else record(checkpoint, env)
+        if isinstance(env, AdaptedEnv):
+            recording = record_environment(checkpoint, setup)
+            spec = environment_spec(checkpoint, env, policy)
+        else:
+            recording = record(checkpoint, env)
+            spec = policy_spec(checkpoint, env, policy)
         # Write each format and check its output against JAX.
         differences = {}
         for name in formats:
@@ -96,9 +96,17 @@ def export_policy(
                 )
             differences[name] = found
         # Write the observations and the description of all files.
-        describe = environment_spec if own else policy_spec
-        _write_spec(unfinished, describe(checkpoint, env, policy), differences, recording)
+        _write_spec(unfinished, spec, differences, recording)
     return ExportedPolicy(folder, checkpoint.env_steps, differences, len(recording.action))
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise an error if a folder that exists is not an export, which a new one may replace."""
+    with runs.writing_to(folder):
+        if folder.exists() and not (folder / FILE).is_file():
+            raise UserError(
+                f"{folder} exists and is not an export: choose a new folder with --output"
+            )
 
 
 def _write_spec(

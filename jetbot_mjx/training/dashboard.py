@@ -341,7 +341,8 @@ class Dashboard(Terminal):
     ) -> "dict[str, str | Text | _Curve]":
         """Return what a row of the table shows, by the name of the column."""
         what, key = "success", "success_rate"
-        form, curve = "{:.1%}", scores
+        # A copy: it is drawn when the lock is no longer held.
+        form, curve = "{:.1%}", list(scores)
         if self._scored_by == "return":
             what, key = "return", "episode_return"
             form, curve = "{:.2f}", scaled(scores)

@@ -42,15 +42,16 @@ def test_one_seed_is_evaluated_over_its_episodes():
 
 
 def test_several_seeds_are_evaluated_over_seeds_and_start_by_start():
-    low = [return_report_of([x, x + 1.0], "runs/a") for x in (1.0, 2.0)]
-    high = [return_report_of([x, 0.0], "runs/b") for x in (5.0, 6.0, 90.0)]
+    low = [return_report_of([x, x + 1.0, x + 0.5], "runs/a") for x in (1.0, 2.0)]
+    high = [return_report_of([x, 0.0, x], "runs/b") for x in (5.0, 6.0, 90.0)]
     found = compared(a=low, b=high)
     a = found.runs[0].episode_return
     assert (a.over, a.count, a.mean.value, a.mean.low, a.mean.high) == ("seeds", 2, 2.0, 1.5, 2.5)
     (pair,) = found.pairs
-    # Start by start only the seeds count that both runs have: b wins the first, a the second.
-    assert (pair.seeds, pair.episode_return.wins, pair.episode_return.losses) == (2, 1, 1)
-    assert pair.episode_return.difference.value == pytest.approx(2.0 - np.mean([2.5, 3.0, 45.0]))
+    # Start by start only the seeds count that both runs have: a wins the second of three.
+    assert (pair.seeds, pair.episode_return.wins, pair.episode_return.losses) == (2, 1, 2)
+    means = [2 * x / 3 for x in (5.0, 6.0, 90.0)]
+    assert pair.episode_return.difference.value == pytest.approx(2.0 - np.mean(means))
 
 
 def test_a_curve_over_seeds_keeps_to_the_steps_they_share():
