@@ -350,7 +350,7 @@ def record_environment(checkpoint: Checkpoint, setup: Setup, count: int = RECORD
     @jax.jit
     def run(keys: Array) -> Array:
         def step(state: PyTree, _: None) -> tuple[PyTree, Array]:
-            return batch.step(state, act(state.obs)[0]), state.obs
+            return batch.step(state, jnp.asarray(act(state.obs)[0])), state.obs
 
         steps = -(-count // _RECORDED_AT_ONCE)
         return jax.lax.scan(step, batch.reset(keys), length=steps)[1]

@@ -79,12 +79,8 @@ def export_policy(
                 f"{folder} exists and is not an export: choose a new folder with --output"
             )
     with runs.atomic_folder(folder) as unfinished:
-        if isinstance(env, AdaptedEnv):
-            recording = record_environment(checkpoint, setup)
-            spec = environment_spec(checkpoint, env, policy)
-        else:
-            recording = record(checkpoint, env)
-            spec = policy_spec(checkpoint, env, policy)
+        own = isinstance(env, AdaptedEnv)
+        recording = record_environment(checkpoint, setup) if own else record(checkpoint, env)
         # Write each format and check its output against JAX.
         differences = {}
         for name in formats:
@@ -100,7 +96,8 @@ def export_policy(
                 )
             differences[name] = found
         # Write the observations and the description of all files.
-        _write_spec(unfinished, spec, differences, recording)
+        describe = environment_spec if own else policy_spec
+        _write_spec(unfinished, describe(checkpoint, env, policy), differences, recording)
     return ExportedPolicy(folder, checkpoint.env_steps, differences, len(recording.action))
 
 

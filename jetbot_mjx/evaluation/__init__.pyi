@@ -31,6 +31,7 @@ from .returns import ReturnSummary as ReturnSummary
 from .returns import summarize_returns as summarize_returns
 from .rollout import Episodes as Episodes
 from .rollout import ReturnEpisodes as ReturnEpisodes
+from .rollout import return_rollout_fn as return_rollout_fn
 from .rollout import rollout_fn as rollout_fn
 from .tables import below_target as below_target
 from .tables import summarize_comparison as summarize_comparison

@@ -52,10 +52,13 @@ class WarmStart(NamedTuple):
     new: list[str]
     """Names of the fields that only the new layout has."""
     dropped: list[str]
+    action_size: int
+    """Number of the policy's outputs that are means, or of choices."""
 
     def apply(self, state: TrainState) -> TrainState:
         """Return a training state before the first step with these parameters."""
-        policy = _with_new_noise(self.params.policy, jax.device_get(state.params.policy))
+        fresh = jax.device_get(state.params.policy)
+        policy = _with_new_noise(self.params.policy, fresh, self.action_size)
         networks = state.params.replace(policy=policy, value=self.params.value)
         return state.replace(params=networks, normalizer=self.params.normalizer)
 
@@ -94,9 +97,10 @@ def make_warm_start(source: Checkpoint, setup: Setup) -> WarmStart:
     rows = match_rows(old, new)
     names = [[field["name"] for field in layout] for layout in (old, new)]
     if (rows < 0).all():
+        theirs, ours = (", ".join(f"{x['name']}[{x['size']}]" for x in one) for one in (old, new))
         raise UserError(
-            f"init_from {source.path}: no field of its observation ({', '.join(names[0])}) is one"
-            f" of {config.code} ({', '.join(names[1])})"
+            f"init_from {source.path}: no field of its observation ({theirs}) is one of"
+            f" {config.code} ({ours})"
         )
     # Take over the networks and the statistics, row by row.
     params = PolicyParams(
@@ -115,6 +119,7 @@ def make_warm_start(source: Checkpoint, setup: Setup) -> WarmStart:
         env_steps=source.env_steps,
         new=[name for name in names[1] if name not in taken],
         dropped=sorted(set(names[0]) - set(taken)),
+        action_size=setup.env.action_size,
     )
 
 
@@ -145,7 +150,7 @@ def _check_networks(source: Checkpoint, config: Config, env: JetBotEnv | Adapted
     if source.about["action_size"] != env.action_size:
         raise UserError(
             f"init_from {source.path}: its policy has {source.about['action_size']} actions, and"
-            f" {config.task.name} has {env.action_size}"
+            f" {config.code} has {env.action_size}"
         )
     normalize = config.ppo.normalize_observations
     if source.config.ppo.normalize_observations != normalize:
@@ -170,20 +175,19 @@ def _match_first_layer(params: PyTree, rows: Int[np.ndarray, " new"]) -> PyTree:
     return jax.tree_util.tree_map_with_path(match, params)
 
 
-def _with_new_noise(trained: PyTree, fresh: PyTree) -> PyTree:
+def _with_new_noise(trained: PyTree, fresh: PyTree, means: int) -> PyTree:
     """Return a policy with smaller means and the noise of a fresh one.
 
     The last layer's outputs are the means of the actions, followed by the parameters of their
-    deviations, which `distribution_type: normal` has in a module of their own instead.
+    deviations, which `distribution_type: normal` has in a module of their own instead. Those of
+    choices have no deviations.
     """
     layers, new = dict(trained["params"]), fresh["params"]
     name = last_layer(layers)
-    has_own_std = "std_param" in layers
-    if has_own_std:
+    if "std_param" in layers:
         layers["std_param"] = new["std_param"]
 
     def mix(x: Float[np.ndarray, "*in out"], new: Float[np.ndarray, "*in out"]) -> np.ndarray:
-        means = x.shape[-1] if has_own_std else x.shape[-1] // 2
         return np.concatenate([MEAN_SCALE * x[..., :means], new[..., means:]], axis=-1)
 
     layers[name] = jax.tree.map(mix, layers[name], new[name])

@@ -319,7 +319,9 @@ class Dashboard(Terminal):
         return Columns(texts, padding=(0, 3)) if texts else "-"
 
     def _table(self) -> "_FirstThatFits":
-        cells = [{"seed": name} | self._cells(*row) for name, *row in self._rows()]
+        cells = [
+            {"seed": name} | self._cells(scores, metrics) for name, scores, metrics in self._rows()
+        ]
         names = [name for name in cells[0] if name != "seed" or len(self._seeds) > 1]
         tables = []
         for count in range(len(_DROPPED) + 1):

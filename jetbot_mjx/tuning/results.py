@@ -17,13 +17,17 @@ from jetbot_mjx.runs import write_model, write_text, writing_to
 from jetbot_mjx.terminal import process_seconds, stage
 from jetbot_mjx.tuning.search import (
     CONFIRM_SEEDS,
+    SCORES,
     Entrant,
     Search,
     completed_trials,
+    format_score,
     quiet,
     ranked_trials,
+    study_score,
 )
 from jetbot_mjx.tuning.space import Parameter, Values, with_values
+from jetbot_mjx.tuning.trials import ScoredBy
 
 with requires_extra("tune", "tune"):
     import optuna
@@ -51,7 +55,8 @@ class TuningResult(NamedTuple):
         """Return the folder and the best values in one line."""
         text = f"TuningResult(folder={str(self.folder)!r}"
         if (best := self.best) is not None:
-            text += f", best={best.name!r}, success={statistics.fmean(best.success_rates):.1%}"
+            score = format_score(statistics.fmean(best.scores), best.scored_by)
+            text += f", best={best.name!r}, {best.scored_by}={score}"
         return f"{text}, values={dict(self.values)})"
 
     @property
@@ -150,33 +155,48 @@ def write_results(
 def entrants_table(entrants: Sequence[Entrant]) -> str:
     """Return a Markdown table of the final trainings."""
     best = best_entrant(entrants)
+    kind = best.scored_by
+    unit = " [%]" if kind == "success" else ""
     lines = [
-        "| | mean success while learning | success [%] | worst seed [%] | mean time [s] | values |",
+        f"| | mean {kind} while learning | {kind}{unit} | worst seed{unit} | mean time [s]"
+        " | values |",
         "|---|---|---|---|---|---|",
     ]
     for one in entrants:
         values = ", ".join(f"{name.split('.')[-1]} {_short(x)}" for name, x in one.values.items())
         lines.append(
             f"| {one.name}{' (best)' if one is best else ''}"
-            f" | {statistics.fmean(one.areas):.2%}"
-            f" | {100 * statistics.fmean(one.success_rates):.2f}"
-            f" | {100 * min(one.success_rates):.2f}"
-            f" | {statistics.fmean(one.mean_seconds):.3f} | {values} |"
+            f" | {format_score(statistics.fmean(one.areas), kind)}"
+            f" | {_number(statistics.fmean(one.scores), kind)} | {_number(min(one.scores), kind)}"
+            f" | {_mean_seconds(one.mean_seconds)} | {values} |"
         )
     return "\n".join(lines)
 
 
+def _number(score: float, scored_by: ScoredBy) -> str:
+    """Return a score below a heading that has its unit."""
+    return format_score(score, scored_by).rstrip("%")
+
+
+def _mean_seconds(seconds: Sequence[float | None]) -> str:
+    known = [one for one in seconds if one is not None]
+    return f"{statistics.fmean(known):.3f}" if known else "-"
+
+
 def _trials_table(study: optuna.Study) -> str:
+    kind = study_score(study)
+    unit = " [%]" if kind == "success" else ""
     names = sorted({name for trial in study.trials for name in trial.params})
     lines = [
-        f"| trial | mean success | last success [%] | mean time [s] | {' | '.join(names)} |",
+        f"| trial | mean {kind} | last {kind}{unit} | mean time [s] | {' | '.join(names)} |",
         "|" + "---|" * (4 + len(names)),
     ]
     for trial in ranked_trials(study):
         values = " | ".join(_short(trial.params.get(name, "-")) for name in names)
         lines.append(
-            f"| {trial.number} | {trial.value:.2%} | {100 * trial.user_attrs['success_rate']:.2f}"
-            f" | {trial.user_attrs['mean_seconds']:.3f} | {values} |"
+            f"| {trial.number} | {format_score(trial.value or 0.0, kind)}"
+            f" | {_number(trial.user_attrs[SCORES[kind]], kind)}"
+            f" | {_mean_seconds([trial.user_attrs['mean_seconds']])} | {values} |"
         )
     return "\n".join(lines)
 
@@ -184,7 +204,8 @@ def _trials_table(study: optuna.Study) -> str:
 def _csv(study: optuna.Study) -> str:
     names = sorted({name for trial in study.trials for name in trial.params})
     text = io.StringIO()
-    columns = ["trial", "state", "score", "success_rate", "mean_seconds", *names, "error"]
+    score = SCORES[study_score(study)]
+    columns = ["trial", "state", "score", score, "mean_seconds", *names, "error"]
     writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for trial in study.trials:

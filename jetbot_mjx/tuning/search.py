@@ -15,7 +15,7 @@ import functools
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,7 +28,7 @@ from jetbot_mjx.evaluation import REPORT_GOALS, report_keys
 from jetbot_mjx.runs import load_checkpoint, make_folder
 from jetbot_mjx.terminal import stage
 from jetbot_mjx.tuning.space import TRACED, Parameter, Value, Values, with_values
-from jetbot_mjx.tuning.trials import Outcome, Trials, mean_seconds
+from jetbot_mjx.tuning.trials import Outcome, ScoredBy, Trials, mean_scores, mean_seconds
 
 with requires_extra("tune", "tune"):
     import optuna
@@ -37,7 +37,7 @@ with requires_extra("tune", "tune"):
     from optuna.trial import FrozenTrial
 
 _EVALUATIONS = 8
-"""Number of evaluations of each trial, whose mean success is maximised."""
+"""Number of evaluations of each trial, whose mean success or return is maximised."""
 _BEAT_SECONDS = 5
 """Time between two heartbeats of a worker [s]."""
 _STALE_SECONDS = 30
@@ -57,6 +57,12 @@ _STORAGE_ERRORS = optuna.exceptions.StorageInternalError, sqlalchemy.exc.SQLAlch
 _OPENING_ERRORS = ImportError, ValueError, RuntimeError
 """Raised for a missing driver, an invalid port, or the database of another version of Optuna."""
 
+SCORES: Mapping[ScoredBy, str] = {"success": "success_rate", "return": "episode_return"}
+"""What a stored trial calls its last score."""
+
+_Final = tuple[float, float, float | None]
+"""Mean score, and on the report score and mean duration [s], of one final training."""
+
 _Static = tuple[tuple[str, Value], ...]
 """Names and values of the static settings of trials that one program trains."""
 
@@ -67,11 +73,13 @@ class Entrant(NamedTuple):
     name: str
     values: Values
     areas: tuple[float, ...]
-    """Mean success over the training, for each seed, on the goals of training."""
-    success_rates: tuple[float, ...]
-    """After training, for each seed, on the report's goals."""
-    mean_seconds: tuple[float, ...]
-    """Mean duration of the report's episodes [s], for each seed; a failed one counts in full."""
+    """Mean score over the training, for each seed, on the goals of training."""
+    scores: tuple[float, ...]
+    """Success rate or mean return after training, for each seed, on the report's goals."""
+    mean_seconds: tuple[float | None, ...]
+    """Mean duration of the report's episodes [s], for each seed; a failed one counts in full. None
+    in an environment of one's own."""
+    scored_by: ScoredBy = "success"
 
 
 @contextlib.contextmanager
@@ -206,9 +214,10 @@ class Search:
         reason = failed[0].user_attrs["error"] if failed else ""
         if len(failed) == count:
             raise UserError(f"none of the last {count} trials could be trained, such as: {reason}")
-        best = max((one.value or 0.0 for one in completed_trials(self.study)), default=float("nan"))
+        done, scored_by = ranked_trials(self.study), study_score(self.study)
+        best = format_score(done[0].value or 0.0, scored_by) if done else "-"
         self._say(
-            f"{len(completed_trials(self.study))} of {trials} trials, best mean success {best:.2%};"
+            f"{len(done)} of {trials} trials, best mean {scored_by} {best};"
             f" this round of {count} took {time.perf_counter() - began:.1f} s"
             + (f"; {len(failed)} could not be trained, such as: {reason}" if failed else "")
         )
@@ -240,7 +249,7 @@ class Search:
             for name, values in chosen.items()
             for index in range(seeds)
         ]
-        done: dict[str, list[tuple[float, float, float]]] = {name: [] for name in chosen}
+        done: dict[str, list[_Final]] = {name: [] for name in chosen}
         with stage("final trainings", len(work)) as advance:
             for key, members in self._groups([values for _, values, _ in work]).items():
                 # In parts of one size, which the program of a round can train.
@@ -249,27 +258,26 @@ class Search:
                     for i, result in zip(part, results, strict=True):
                         done[work[i][0]].append(result)
                     advance(len(part))
-        return [
-            Entrant(name, dict(chosen[name]), *zip(*found, strict=True))
-            for name, found in done.items()
-        ]
+        scored_by, entrants = study_score(self.study), []
+        for name, found in done.items():
+            areas, scores, seconds = zip(*found, strict=True)
+            entrants.append(Entrant(name, dict(chosen[name]), areas, scores, seconds, scored_by))
+        return entrants
 
     def values_of(self, trial: FrozenTrial) -> dict[str, Value]:
         """Return the values of a trial that is stored."""
         return {one.name: one.from_optuna(trial.params[one.name]) for one in self._space}
 
-    def _final(
-        self, work: Sequence[tuple[str, Values, int]], key: _Static
-    ) -> list[tuple[float, float, float]]:
-        """Train values with seeds; return mean success, and success and time on the report."""
+    def _final(self, work: Sequence[tuple[str, Values, int]], key: _Static) -> list[_Final]:
+        """Train values with seeds; return mean score, and score and time on the report."""
         batch = self._batch(key)
         outcomes = self._outcomes(batch, [values for _, values, _ in work], [x[2] for x in work])
         stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
         with stage("episodes of the report's goals", len(work) * REPORT_GOALS):
             episodes = jax.device_get(batch.evaluate(stacked, report_keys(REPORT_GOALS)))
-        rates = np.asarray(episodes.success).mean(axis=1).tolist()
+        scores = mean_scores(episodes, outcomes[0].scored_by)
         areas, seconds = [one.area for one in outcomes], mean_seconds(episodes, batch.config)
-        return list(zip(areas, rates, seconds, strict=True))
+        return list(zip(areas, scores, seconds, strict=True))
 
     def _check_study(self) -> None:
         """Refuse a study that was begun with another space or configuration."""
@@ -401,10 +409,10 @@ class Search:
     def _tell(self, trial: optuna.Trial, outcome: Outcome) -> None:
         # Another worker may have taken this one for dead, after Ctrl-Z for example.
         if self._is_running(trial):
-            trial.set_user_attr("success_rate", outcome.success_rates[-1])
+            trial.set_user_attr(SCORES[outcome.scored_by], outcome.scores[-1])
             trial.set_user_attr("mean_seconds", outcome.mean_seconds)
-            for step, rate in enumerate(outcome.success_rates):
-                trial.report(rate, step)
+            for step, score in enumerate(outcome.scores):
+                trial.report(score, step)
             self.study.tell(trial, outcome.area)
 
     def _fail(self, trial: optuna.Trial, error: UserError) -> None:
@@ -458,6 +466,17 @@ class Search:
             with stage("preparing the environment and the networks"):
                 self._batches[key] = Trials(config, traced, _EVALUATIONS)
         return self._batches[key]
+
+
+def study_score(study: optuna.Study) -> ScoredBy:
+    """Return what the trials of a study are compared by."""
+    returns = any(SCORES["return"] in one.user_attrs for one in completed_trials(study))
+    return "return" if returns else "success"
+
+
+def format_score(score: float, scored_by: ScoredBy) -> str:
+    """Return a score as text."""
+    return f"{score:.2%}" if scored_by == "success" else f"{score:.2f}"
 
 
 def completed_trials(study: optuna.Study) -> list[FrozenTrial]:

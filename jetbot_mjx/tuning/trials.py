@@ -8,7 +8,7 @@ run one group after the other.
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +17,15 @@ from jaxtyping import Array, Float, Int32, PyTree, UInt32
 
 from jetbot_mjx.agents import PPO, TrainState
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs import maybe_randomize
-from jetbot_mjx.evaluation import Episodes, policy_controller, rollout_fn, training_keys
+from jetbot_mjx.envs import AdaptedEnv, maybe_randomize
+from jetbot_mjx.evaluation import (
+    Episodes,
+    ReturnEpisodes,
+    policy_controller,
+    return_rollout_fn,
+    rollout_fn,
+    training_keys,
+)
 from jetbot_mjx.runs import Setup, load_checkpoint, make_warm_start
 from jetbot_mjx.terminal import stage
 from jetbot_mjx.tuning.space import TRACED, Values
@@ -29,20 +36,27 @@ Traced = Mapping[str, Float[Array, "*trials"]]
 """Values of settings of PPO by name, with an axis of trials or without."""
 
 
+ScoredBy = Literal["success", "return"]
+"""What trials are compared by: the success rate, or the mean return where there is none."""
+
+
 class Outcome(NamedTuple):
     """An `Outcome` holds how one trial learned."""
 
-    success_rates: tuple[float, ...]
-    """After each interval of the training, on the goals of evaluations during training."""
-    mean_seconds: float
-    """Mean duration of the last evaluation's episodes [s]; a failed one counts in full."""
+    scores: tuple[float, ...]
+    """Success rates after each interval of the training, on the goals of evaluations during
+    training; or mean returns."""
+    mean_seconds: float | None
+    """Mean duration of the last evaluation's episodes [s]; a failed one counts in full. None in an
+    environment of one's own."""
     params: PyTree
     """The last parameters of the policy, on the host."""
+    scored_by: ScoredBy = "success"
 
     @property
     def area(self) -> float:
-        """Return the mean of the success rates, which rewards learning early and well."""
-        return float(np.mean(self.success_rates))
+        """Return the mean of the scores, which rewards learning early and well."""
+        return float(np.mean(self.scores))
 
 
 class Trials:
@@ -71,11 +85,13 @@ class Trials:
         self._warm_start = None
         if config.init_from is not None:
             self._warm_start = make_warm_start(load_checkpoint(config.init_from), setup)
-        episodes = rollout_fn(
-            maybe_randomize(setup.robot_env),
-            [policy_controller(self._networks)],
-            config.task.episode_length,
-        )
+        policies, length = [policy_controller(self._networks)], config.task.episode_length
+        self._scored_by: ScoredBy = "success"
+        if isinstance(setup.env, AdaptedEnv):
+            episodes = return_rollout_fn(setup.env, policies, length)
+            self._scored_by = "success" if setup.env.has_success else "return"
+        else:
+            episodes = rollout_fn(maybe_randomize(setup.env), policies, length)
         steps = np.linspace(0, config.ppo.training_steps, evaluations + 1).round().astype(np.int32)
         self._steps = np.diff(steps)
         init = jax.vmap(lambda traced, seed: self._ppo(traced).init(jax.random.PRNGKey(seed)))
@@ -118,26 +134,27 @@ class Trials:
                 state = self._advance(traced, state, np.int32(0))
                 self.evaluate(state.policy_params, goals)
                 self._compiled.add(width)
-        rates, episodes = [], None
+        scores, episodes = [], None
         with stage(f"intervals of training {count} policies", len(self._steps)) as advance:
             for steps in self._steps:
                 state = self._advance(traced, state, np.int32(steps))
                 episodes = self.evaluate(state.policy_params, goals)
-                rates.append(np.asarray(episodes.success).mean(axis=1))
+                scores.append(mean_scores(episodes, self._scored_by))
                 advance(1)
         assert episodes is not None
         seconds = mean_seconds(episodes, self.config)
         params = jax.device_get(state.policy_params)
         return [
             Outcome(
-                tuple(float(rate[i]) for rate in rates),
+                tuple(each[i] for each in scores),
                 seconds[i],
                 jax.tree.map(lambda x, i=i: x[i], params),
+                self._scored_by,
             )
             for i in range(count)
         ]
 
-    def evaluate(self, params: PyTree, keys: UInt32[Array, "n 2"]) -> Episodes:
+    def evaluate(self, params: PyTree, keys: UInt32[Array, "n 2"]) -> Episodes | ReturnEpisodes:
         """Run deterministic episodes of several policies.
 
         Args:
@@ -162,8 +179,19 @@ class Trials:
         return PPO(self.config.ppo.model_copy(update=dict(traced)), self._env, self._networks)
 
 
-def mean_seconds(episodes: Episodes, config: Config) -> list[float]:
-    """Return the mean duration of each policy's episodes [s]; a failed one counts in full."""
+def mean_scores(episodes: Episodes | ReturnEpisodes, scored_by: ScoredBy) -> list[float]:
+    """Return the success rate or the mean return of each policy."""
+    each = episodes.success if scored_by == "success" else episodes.episode_return
+    return np.asarray(each, float).mean(axis=1).tolist()
+
+
+def mean_seconds(episodes: Episodes | ReturnEpisodes, config: Config) -> list[float] | list[None]:
+    """Return the mean duration of each policy's episodes [s]; a failed one counts in full.
+
+    In an environment of one's own, there is none.
+    """
+    if config.environment is not None:
+        return [None] * len(episodes.steps)
     success, steps = np.asarray(episodes.success), np.asarray(episodes.steps)
     lasted = np.where(success > 0, steps, config.task.episode_length)
     return (lasted.mean(axis=1) * config.physics.ctrl_dt).tolist()

@@ -1,5 +1,4 @@
 from .gallery import GALLERY_EPISODES as GALLERY_EPISODES
-from .gallery import VIDEO_EPISODES as VIDEO_EPISODES
 from .gallery import Rendered as Rendered
 from .gallery import render_gallery as render_gallery
 from .gallery import render_run as render_run

@@ -100,14 +100,11 @@ def render_run(
     # Choose the goals and the names of the files.
     if episodes is not None:
         check_count("episodes", episodes, evaluation.REPORT_GOALS)
+    if goals is not None:
+        evaluation.check_goals(goals)
     checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
     if checkpoint.config.environment is not None:
-        if goals is not None:
-            raise UserError(
-                f"--goals is for robots, and the run has environment ="
-                f" {checkpoint.config.environment!r}: give --episodes"
-            )
-        return _render_environment(checkpoint, episodes or _ENVIRONMENT_EPISODES)
+        return _render_environment(checkpoint, episodes or _ENVIRONMENT_EPISODES, goals)
     if goals is None:
         episodes = episodes or VIDEO_EPISODES
         goals = range(episodes)
@@ -116,7 +113,6 @@ def render_run(
             for name in ("episodes", "trajectories")
         ]
     else:
-        evaluation.check_goals(goals)
         names = (f"goals-{evaluation.format_goals(goals)}",) * 2
     # Run the episodes.
     setup = checkpoint.make_setup()
@@ -136,8 +132,19 @@ def render_run(
     return Rendered(successes, len(goals), files)
 
 
-def _render_environment(checkpoint: runs.Checkpoint, episodes: int) -> Rendered:
-    """Render a policy from the report's first starts, in an environment of one's own."""
+def _render_environment(
+    checkpoint: runs.Checkpoint, episodes: int, goals: Sequence[int] | None
+) -> Rendered:
+    """Render a policy from the report's first starts, in an environment of one's own.
+
+    Raises:
+      UserError: there are goals to drive to, no model of MuJoCo, or no OpenGL.
+    """
+    if goals is not None:
+        raise UserError(
+            f"--goals is for robots, and the run has environment ="
+            f" {checkpoint.config.environment!r}: give --episodes"
+        )
     setup = checkpoint.make_setup()
     env = setup.env
     assert isinstance(env, AdaptedEnv)

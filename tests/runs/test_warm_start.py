@@ -2,7 +2,7 @@
 
 import shutil
 
-from helpers import gliding
+from helpers import gliding, point_mass
 import jax
 import numpy as np
 import pytest
@@ -119,7 +119,7 @@ def test_the_exploration_noise_is_reset_and_the_mean_action_kept(source):
     config = config_of()
     env = make_env(config)
     fresh = networks_of(config, env).policy_network.init(jax.random.PRNGKey(0))
-    mixed = warm_start._with_new_noise(source.params.policy, fresh)
+    mixed = warm_start._with_new_noise(source.params.policy, fresh, 2)
     last, old, new = (
         x["params"]["hidden_3"]["kernel"] for x in (mixed, source.params.policy, fresh)
     )
@@ -149,6 +149,30 @@ def test_a_normal_distribution_starts_from_a_policy_too(tmp_path):
     kernel = source["MLP_0"]["hidden_0"]["kernel"]
     np.testing.assert_array_equal(matched["hidden_0"]["kernel"][1:], kernel)
     assert not matched["hidden_0"]["kernel"][0].any()
+
+
+def test_choices_of_an_environment_begin_with_those_of_a_policy(tmp_path):
+    session.run(point_mass.config("Choosing"), tmp_path / "source")
+    changes = {"seed": 1, "init_from": str(tmp_path / "source")}
+    session.run(point_mass.config("Choosing", **changes), tmp_path / "run")
+    start, source = (
+        load_checkpoint(tmp_path / name, which).params.policy["params"]
+        for name, which in (("run", 0), ("source", "best"))
+    )
+    np.testing.assert_array_equal(start["hidden_0"]["kernel"], source["hidden_0"]["kernel"])
+    # There is no noise that could be that of a new policy.
+    scores = np.float32(0.25) * source["hidden_1"]["kernel"]
+    np.testing.assert_array_equal(start["hidden_1"]["kernel"], scores)
+
+
+def test_an_observation_of_another_size_is_refused_with_both(tmp_path):
+    session.run(point_mass.config(), tmp_path / "source")
+    other = load_checkpoint(tmp_path / "source")
+    layout = [{"name": "observation", "size": 3, "unit": "", "frame": ""}]
+    other = other._replace(about={**other.about, "layout": layout})
+    said = r"no field of its observation \(observation\[3\]\) is one of .* \(observation\[2\]\)"
+    with pytest.raises(UserError, match=said):
+        warm_start.make_warm_start(other, Setup(point_mass.config()))
 
 
 @pytest.mark.parametrize(

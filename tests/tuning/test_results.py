@@ -1,7 +1,14 @@
-"""The tables of a search: values as YAML writes them."""
+"""The results of a search: tables with values as YAML writes them, success or return."""
 
-from jetbot_mjx.tuning.results import entrants_table
+import re
+import statistics
+
+from helpers import point_mass
+from jetbot_mjx.config import load_config
+from jetbot_mjx.tuning.results import entrants_table, run_search
 from jetbot_mjx.tuning.search import Entrant
+from jetbot_mjx.tuning.space import read_space
+from jetbot_mjx.tuning.trials import Trials
 
 
 def test_values_in_the_table_can_be_copied_into_a_configuration():
@@ -17,3 +24,29 @@ def test_values_in_the_table_can_be_copied_into_a_configuration():
         " | desired_kl null, normalize_observations true, value_hidden_layer_sizes [64, 64],"
         " learning_rate 0.001235, activation tanh |"
     )
+
+
+def test_a_search_in_an_environment_maximises_the_return(tmp_path):
+    config = point_mass.config()
+    space = read_space({"ppo.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True}}, config)
+    said = []
+    folder = tmp_path / "found"
+    found = run_search(config, space, folder, trials=2, round_size=2, confirm=1, say=said.append)
+    # Every reward is at most 1, and an episode has 16.
+    assert re.match(r"2 of 2 trials, best mean return 1\d\.\d\d; this round of 2 took", said[0])
+    best = found.best
+    assert (best.scored_by, best.mean_seconds) == ("return", (None,) * 5)
+    assert all(10 < score <= 16 for score in best.scores)
+    assert f"return={statistics.fmean(best.scores):.2f}" in repr(found)
+    tables = (folder / "trials.md").read_text().splitlines()
+    assert tables[0].startswith("| | mean return while learning | return | worst seed | mean time")
+    assert "| trial | mean return | last return | mean time [s] | ppo.learning_rate |" in tables
+    assert (folder / "trials.csv").read_text().startswith("trial,state,score,episode_return,")
+    assert load_config(folder / "best.yaml").environment == config.environment
+
+
+def test_where_an_environment_tells_successes_they_are_the_score():
+    config = point_mass.config(environment_options={"succeeds": True})
+    (outcome,) = Trials(config, (), evaluations=2).run([{}], [0])
+    assert outcome.scored_by == "success"
+    assert all(0 <= score <= 1 for score in outcome.scores)

@@ -323,7 +323,7 @@ def test_results_are_written(tmp_path):
     assert entrants[0].name == "as given"
     # The given configuration, which was the first trial, is not retrained twice.
     assert "trial 0" not in {each.name for each in entrants}
-    assert entrants[0].success_rates == (0.5,) * 3
+    assert entrants[0].scores == (0.5,) * 3
     # A failed episode counts with its whole time: 60 and 256 steps of 1/60 s.
     assert entrants[0].mean_seconds[0] == pytest.approx((60 + 256) / 2 / 60)
     path = results.write_results(folder, CONFIG, one, entrants)

@@ -91,8 +91,8 @@ def test_a_trial_does_not_depend_on_its_neighbours(trials, outcomes):
 
 def test_outcomes_are_measured(trials, outcomes):
     for one in outcomes:
-        assert len(one.success_rates) == 2
-        assert one.area == pytest.approx(np.mean(one.success_rates))
+        assert len(one.scores) == 2
+        assert one.area == pytest.approx(np.mean(one.scores))
         assert 0 < one.mean_seconds <= 40 / 60 + 1e-6
     stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
     assert trials.evaluate(stacked, report_keys(5)).success.shape == (3, 5)

@@ -117,14 +117,14 @@ def test_goal_time_distance_and_outcome_are_written_in(renderer, drive, written,
     assert written.count(outcome) == 1
     assert frames[0].shape == (SIDE, 2 * SIDE, 3)
     # Real time, and then it stands for a while.
-    assert len(frames) == 1 + 0.5 * FPS + round(video._HOLD_SECONDS * FPS)
+    assert len(frames) == 1 + 0.5 * FPS + round(video.HOLD_SECONDS * FPS)
     assert all(np.array_equal(frames[5], frame) for frame in frames[6:])
 
 
 def test_finished_robots_stop_while_the_others_drive(renderer, drive, written):
     short, long = drive((0.3, 0.0), (0.4, 0.0)), drive((-0.9, 0.0), (0.4, 0.0), reached=False)
     frames = list(renderer.render_side_by_side([("0 steps", short), ("9 steps", long)]))
-    assert len(frames) == 1 + 0.9 * FPS + round(video._HOLD_SECONDS * FPS)
+    assert len(frames) == 1 + 0.9 * FPS + round(video.HOLD_SECONDS * FPS)
     assert frames[0].shape == (SIDE, 2 * SIDE, 3)
     left, right = ([frame[:, at : at + SIDE] for frame in frames] for at in (0, SIDE))
     assert all(np.array_equal(left[3], panel) for panel in left[4:])

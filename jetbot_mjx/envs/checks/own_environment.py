@@ -7,6 +7,7 @@ A training would run for minutes on a reward that is not a number, or with a sta
 import functools
 import time
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -165,7 +166,8 @@ def _faults(env: AdaptedEnv, rare: float = _RARE) -> Iterator[str]:
 
 
 def _compiled(traced: jax.stages.Traced) -> jax.stages.Compiled:
-    return traced.lower().compile(_QUICKLY if jax.default_backend() == "cpu" else None)
+    options: Any = _QUICKLY if jax.default_backend() == "cpu" else None
+    return traced.lower().compile(options)
 
 
 def _drive(env: AdaptedEnv, first: State) -> dict[str, Array]:
