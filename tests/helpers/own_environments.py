@@ -68,6 +68,9 @@ class NoisyPoint:
         return OwnState(place, place, self.observe(place), zero, zero, {"distance": zero}, info)
 
     def step(self, state, action):
+        # A key comes back as what it was.
+        is_new = jnp.issubdtype(state.info["key"].dtype, jax.dtypes.prng_key)
+        assert is_new is not self.old_keys
         key, own = jax.random.split(state.info["key"])
         place = state.place + 0.1 * action + 0.01 * jax.random.normal(own, (2,))
         count = state.info["count"] + 1

@@ -28,6 +28,7 @@ from benchmarks.throughput import (
     baselines,
     compare,
     ensembles,
+    environments,
     fuse,
     kernels,
     longest_chain,
@@ -586,6 +587,27 @@ def test_a_row_says_what_took_too_long(monkeypatch):
     late = programs.measure_within(9, "search", 1, 1)
     assert late.note == "XLA: not within 9 s"
     assert programs.table_line(late).split()[:4] == ["search", "1", "1.0", "us"]
+
+
+def test_an_environment_is_measured_by_kernels_and_by_xla(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(timing, "REPEAT_SECONDS", 0.01)
+    mine, output = tmp_path / "mine.yaml", tmp_path / "rates.json"
+    mine.write_text("environment: helpers.own_environments:Point\n")
+    given = ["--num-envs", "64", "--repeats", "1", "--output", str(output)]
+    assert environments.main([str(mine), *given]) == 0
+    (row,) = json.loads(output.read_text())["rows"]
+    assert (row["environment"], row["num_envs"]) == ("mine", 64)
+    assert row["ratio"] == pytest.approx(row["kernels"] / row["xla"])
+    assert "| mine | 64 |" in capsys.readouterr().out
+    # A library that is not installed is skipped, and an environment that gets lost is told.
+    absent = {"absent": {"environment": "not_installed_anywhere:make"}}
+    monkeypatch.setattr(environments, "_LIBRARIES", absent)
+    assert environments.main(given) == 0
+    assert json.loads(output.read_text())["rows"] == []
+    assert "absent is skipped: environment = 'not_installed" in capsys.readouterr().err
+    mine.write_text("environment: helpers.broken_environments:DividesByZero\n")
+    with pytest.raises(UserError, match="states were not finite"):
+        environments.main([str(mine), *given])
 
 
 def test_an_ensemble_is_solved_alike_as_one_kernel_and_by_xla(tmp_path, monkeypatch, capsys):
