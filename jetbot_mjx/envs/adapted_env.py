@@ -230,12 +230,12 @@ class AdaptedEnv(Env):
 
     @property
     def has_success(self) -> bool:
-        """Whether the environment tells in which step it is solved."""
+        """Return whether the environment tells in which step it is solved."""
         return SUCCESS in self.metrics
 
     @property
     def may_be_kernel(self) -> bool:
-        """Whether reset and step may be kernels on this machine."""
+        """Return whether reset and step may be kernels on this machine."""
         if not self.kernel_impl.is_available:
             self.kernel_impl.report_obstacle()
         return self.kernel_impl.is_available

@@ -398,17 +398,17 @@ class JetBotEnv(Env):
 
     @property
     def layout(self) -> Layout:
-        """The numbers of the observation."""
+        """Return what the numbers of the observation are."""
         return self.task.layout
 
     @property
     def kernel_impl(self) -> KernelImpl:
-        """What computes a step: one kernel, or XLA."""
+        """Return the setting that decides whether a step is one kernel."""
         return self.physics.kernel_impl
 
     @property
     def may_be_kernel(self) -> bool:
-        """Whether physics may be a kernel, and so the whole step."""
+        """Return whether physics may be a kernel, and so the whole step."""
         return self.physics.may_be_kernel
 
     @property
