@@ -510,7 +510,7 @@ def _complete_message(config: Config, standings: Sequence[Standing]) -> str:
     planned = config.ppo.training_steps * config.ppo.steps_per_training_step
     setting = "ppo.num_timesteps"
     if steps < planned:
-        setting = "stop_at_return" if config.stop_at_success is None else "stop_at_success"
+        setting = "stop_at_success" if config.stop_at_return is None else "stop_at_return"
     return f"complete after {steps:,} steps; raise {setting} to train further"
 
 

@@ -123,8 +123,8 @@ def test_a_training_returns_its_result_and_prints_nothing(tmp_path, capfd):
     assert result.run_dir == tmp_path / "run"
     assert [line.env_steps for line in result.history] == [0, STEP, 2 * STEP]
     assert result.history[-1].metrics["eval/success_rate"] is not None
-    rate = f"{result.best.success_rate:.1%}"
-    assert repr(result) == f"Result(run_dir='{tmp_path}/run', success={rate}, finished=True)"
+    best = f"{result.best.success_rate:.1%} success"
+    assert repr(result) == f"Result(run_dir='{tmp_path}/run', best={best}, finished=True)"
     assert load_checkpoint(result.run_dir, "last").config == load_config("smoke", SMALL)
 
 

@@ -669,6 +669,7 @@ def refused(use, *arguments):
 CHANGES = {
     "ppo.num_timesteps": 65_000,
     "stop_at_success": 0.01,
+    "stop_at_return": -1.5,
     "checkpoint_interval": 8_192,
     "checkpoints_to_keep": 1,
     "preemption_notice": 60.0,
