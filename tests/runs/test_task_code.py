@@ -159,7 +159,7 @@ def test_stored_source_runs_where_the_module_cannot_be_found(tmp_path, monkeypat
     assert issubclass(found, GoalTask)
     assert (found.__module__, found.factor) == (NAME, 3)
     said = capsys.readouterr().err
-    assert said == f"running the task's code stored in run/task/{NAME}.py\n"
+    assert said == f"running the code stored in run/task/{NAME}.py\n"
     # It leaves no trace.
     assert (sys.path, sys.meta_path, sys.dont_write_bytecode) == before
     assert own_modules() == set()
@@ -315,13 +315,13 @@ def test_a_run_is_whole_without_the_module_and_resumes_with_its_own_task(
     assert load_checkpoint(run_dir).make_env().task.factor == 3
     monkeypatch.setattr(task_code, "_said", set())
     capsys.readouterr()
-    task_class, code = session._find_task(config.task.name, [run_dir])
+    task_class, code = session._find_code(config.task.name, [run_dir])
     assert (task_class.factor, code) == (3, None)
     assert f"{NAME} on disk differs from the code this run was" in capsys.readouterr().err
     # A new run has the new one, in the folders of all of its seeds.
     two = parse_config({**config.model_dump(), "seeds": 2})
     run_dirs = [tmp_path / "two" / f"seed-{n}" for n in (0, 1)]
-    task_class, code = session._find_task(config.task.name, run_dirs)
+    task_class, code = session._find_code(config.task.name, run_dirs)
     assert task_class is None
     assert dict(code.files)["kicking_tools.py"] == TOOLS.format(4).encode()
     for folder in run_dirs:
