@@ -30,6 +30,7 @@ _UNUSED_DAYS = 30
 _tracing = threading.Lock()
 
 _CACHE_HIT = "/jax/compilation_cache/cache_hits"
+_CACHE_REQUEST = "/jax/compilation_cache/compile_requests_use_cache"
 
 Notice = Any
 """Something that users were told. Only `Notices` knows its type, which must be picklable."""
@@ -286,11 +287,11 @@ def cache_folder(path: Path, *, by_processor: bool = False) -> Path:
     return folder
 
 
-class _CacheHits:
-    """A counter of the programs that this thread finds in JAX's own cache."""
+class _CacheEvents:
+    """A counter of the programs that this thread looks for in JAX's own cache, and finds there."""
 
     def __enter__(self) -> Self:
-        self.count = 0
+        self.requests = self.hits = 0
         # JAX tells all listeners of all threads.
         self._thread = threading.get_ident()
         jax.monitoring.register_event_listener(self._listen)
@@ -300,19 +301,23 @@ class _CacheHits:
         jax.monitoring.unregister_event_listener(self._listen)
 
     def _listen(self, event: str, **kwargs: str | int) -> None:
-        self.count += event == _CACHE_HIT and threading.get_ident() == self._thread
+        if threading.get_ident() == self._thread:
+            self.requests += event == _CACHE_REQUEST
+            self.hits += event == _CACHE_HIT
 
 
 def _compiled(lowered: jax.stages.Lowered, options: Options) -> tuple[jax.stages.Compiled, bool]:
     """Compile a program; return also whether it must not be serialized.
 
-    That is so on a CPU if JAX took it from its own cache: XLA would leave out some functions.
+    That is so on a CPU if JAX took it from its own cache: XLA would leave out some functions. A
+    program that JAX did not look for there is one that this process had already, perhaps from there.
     """
     # Tracing may have found small programs in JAX's cache, which do not count.
-    with _CacheHits() as hits:
+    with _CacheEvents() as events:
         # JAX passes numbers on, too, although its annotation does not say so.
         program = lowered.compile(compiler_options=options)  # pyright: ignore[reportArgumentType]
-    return program, hits.count > 0 and jax.default_backend() == "cpu"
+    reused = events.requests == 0 and jax.config.values["jax_enable_compilation_cache"]
+    return program, (events.hits > 0 or reused) and jax.default_backend() == "cpu"
 
 
 def _load(path: Path) -> _Stored | None:

@@ -227,6 +227,22 @@ def test_what_a_cpu_finds_in_jax_s_cache_is_compiled_once_more_and_written(jax_c
         assert twice(found) == [0, 2, 4]
 
 
+def test_what_this_process_has_found_there_before_is_compiled_once_more(jax_cache, folder):
+    tripled = jax.jit(lambda x: 3 * jnp.sin(x).at[1].set(x.sum()))
+
+    def trace():
+        return tripled.trace(np.float32([0, 1, 2]))
+
+    ProgramCache({}).compile("one", trace)
+    jax.clear_caches()
+    # JAX finds it in its cache, and then it is in memory.
+    for kept in (None, folder):
+        ProgramCache({}, kept, KEY).compile("one", trace)
+    found = ProgramCache({}, folder, KEY).find("one")
+    assert found is not None
+    assert found(np.float32([0, 1, 2]))[1] == 9.0
+
+
 def test_what_a_cpu_still_finds_there_is_not_written(jax_cache, folder, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     monkeypatch.setattr(program_cache, "unseen_options", dict)

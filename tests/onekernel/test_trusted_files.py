@@ -220,7 +220,7 @@ def test_code_that_others_can_have_written_is_not_run(
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # Nothing of JAX's own, if this is the first test of the process to compile.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 3600.0)
-    monkeypatch.setattr(program_cache, "_CacheHits", NoHits)
+    monkeypatch.setattr(program_cache, "_CacheEvents", NoHits)
     is_found = keep(folder)
     assert is_found()
     # XLA for GPUs has folders of its own there.
@@ -234,7 +234,7 @@ def test_code_that_others_can_have_written_is_not_run(
 class NoHits:
     """As if JAX had nothing in its own cache: what it has a CPU cannot write again."""
 
-    count = 0
+    requests, hits = 1, 0
 
     def __enter__(self):
         return self
