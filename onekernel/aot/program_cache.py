@@ -309,8 +309,8 @@ class _CacheEvents:
 def _compiled(lowered: jax.stages.Lowered, options: Options) -> tuple[jax.stages.Compiled, bool]:
     """Compile a program; return also whether it must not be serialized.
 
-    That is so on a CPU if JAX took it from its own cache: XLA would leave out some functions. A
-    program that JAX did not look for there is one that this process had already, perhaps from there.
+    That is so on a CPU if JAX took it from its own cache: XLA would leave out some functions. If
+    JAX did not look there, this process has the program already, perhaps from there.
     """
     # Tracing may have found small programs in JAX's cache, which do not count.
     with _CacheEvents() as events:
