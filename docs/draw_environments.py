@@ -1,4 +1,4 @@
-"""Draw the standard tasks side by side: `python docs/draw_environments.py docs/environments.png`."""
+"""Draw the standard tasks: `python docs/draw_environments.py docs/environments.png`."""
 
 import sys
 

@@ -45,7 +45,7 @@ def test_a_thread_of_the_package_reports_to_those_who_started_it():
 
 
 def test_what_a_task_does_that_no_kernel_can_is_said_with_its_line(capsys):
-    env = wrap_for_training(make_env(parse_config({}), task_class=Transforming), 10)
+    env = wrap_for_training(make_env(parse_config({}), own_class=Transforming), 10)
     keys = jax.random.split(jax.random.PRNGKey(0), 2)
     with collect() as found:
         jax.eval_shape(lambda keys: env.step(env.reset(keys), jnp.zeros((2, 2))), keys)

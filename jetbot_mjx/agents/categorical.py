@@ -8,8 +8,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.training.distribution import ParametricDistribution
 from jaxtyping import Array, Float, UInt32
+
+# Before the rest of Brax.
+from jetbot_mjx.agents import brax_parts as brax_parts
+
+# isort: split
+from brax.training.distribution import ParametricDistribution
 
 
 class Choice(NamedTuple):

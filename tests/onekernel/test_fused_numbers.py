@@ -107,7 +107,7 @@ class WeighsWithZero(GoalTask):
 
 def test_a_nan_reward_ends_the_episode():
     config = parse_config({"task": {"observation": "egocentric"}})
-    env = make_env(config, task_class=WeighsWithZero)
+    env = make_env(config, own_class=WeighsWithZero)
     batch = wrap_for_training(env, 40)
     plain = NewEpisodeWrapper(EpisodeWrapper(env, 40))
     state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), 8))

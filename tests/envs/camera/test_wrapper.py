@@ -170,7 +170,7 @@ class Crates(GoalTask):
 
 
 def test_a_task_s_bodies_stand_in_the_picture():
-    env = make_env(make_config("camera+world", width=64, height=48, fovy=60.0), task_class=Crates)
+    env = make_env(make_config("camera+world", width=64, height=48, fovy=60.0), own_class=Crates)
     assert env.observation_size == {PIXELS: (48, 64, 3), NUMBERS: (1,)}
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     assert state.obs[NUMBERS].shape == (1,)
@@ -223,9 +223,9 @@ def test_an_invalid_range_is_refused_in_one_line(build_scene, message):
             build_scene(spec)
 
     with pytest.raises(UserError) as error:
-        make_env(make_config(), task_class=Own)
+        make_env(make_config(), own_class=Own)
     assert message in str(error.value)
     assert str(error.value).startswith("task.observation: the camera ")
     # Whoever sees nothing may have it.
     if build_scene is not with_joint:
-        make_env(make_config("world"), task_class=Own)
+        make_env(make_config("world"), own_class=Own)
