@@ -204,7 +204,7 @@ def _compose(
         # Only now it is known what the programs depend on.
         setup.programs = envs.open_program_cache(config, own=envs.own_fingerprint(setup.env))
     if isinstance(setup.env, AdaptedEnv) and not setup.programs.has("advance"):
-        # It costs about a second, and what was trained before has passed it.
+        # What was trained before has passed it.
         envs.require_sound(setup.env)
     hints = [] if isinstance(setup.env, AdaptedEnv) else envs.training_hints(setup.env)
     ppo = ppo_trainer.build_ppo(setup)

@@ -33,9 +33,16 @@ BROKEN = {
     "DrawsAResetFromNumpy": "reset and step are another program each time",
     "NamesAMetricAnewEachTime": "a step changes the state's metrics['speed_",
     "ResetsSlowly": "s, and every episode begins with one: compute in __init__ what all episodes",
-    "IsAlwaysDone": "done is 1 in every step: it should be 1 only where an episode ends",
+    "IsAlwaysDone": "done is 1 in the first step of every episode: it should be 1 only where an",
+    "EndsAtOnce": "done is 1 in the first step of every episode: it should be 1 only where an",
     "IsHalfDone": "done is 0.5 in a step: it should be 0 or 1",
     "IsDoneByMinusOne": "done is -1 in a step: it should be 0 or 1",
+    "HalfSucceeds": "success is 0.5 in a step: it should be 0 or 1",
+    "CountsItsSuccesses": "success is 2 in a step: it should be 0 or 1",
+    "SucceedsByNothing": "metrics['success'] is not finite in 1,024 of 1,024 steps",
+    "ComparesInstances": "a step of 16 instances gives another reward than each of them alone: no",
+    "ResetsTheBatch": "a reset of 16 instances gives another obs than each of them alone: no",
+    "CallsOneInPython": "a batch of steps raises NotImplementedError: vmap is only supported",
     "ObservesAMatrix": "observation has the shape [1, 2]: it should be a vector, such as x.ravel()",
     "ObservesImages": "observation['pixels'] has the shape [8, 8, 3]: it should be a vector",
     "ObservesNothing": "observation is empty: it should be a vector",
@@ -134,6 +141,10 @@ def test_a_rare_state_that_is_not_finite_is_left_to_the_training():
     # The command that looks for mistakes tells it.
     (finding,) = dict(check_environment(config))["drive"]
     assert finding.startswith("reward is not finite in ")
+
+
+def test_an_environment_need_not_end():
+    assert dict(check_environment(config_of("NeverEnds"))) == {x: [] for x in ENVIRONMENT_CHECKS}
 
 
 def test_each_check_is_told_up_to_the_first_with_findings():
