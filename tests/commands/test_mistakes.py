@@ -48,6 +48,7 @@ FILES = {
         "        return {}['missing']\n"
     ),
     "my_env.py": (
+        "import jax\n"
         "import jax.numpy as jnp\n"
         "from jetbot_mjx import State\n"
         "class Balance:\n"
@@ -74,6 +75,23 @@ FILES = {
         "    def step(self, state, action):\n"
         "        self.count += 1\n"
         "        return state.replace(reward=jnp.float32(self.count))\n"
+        "class Ending(Balance):\n"
+        "    def step(self, state, action):\n"
+        "        return state.replace(done=jnp.ones(()))\n"
+        "class Scoring(Balance):\n"
+        "    def step(self, state, action):\n"
+        "        return state.replace(info={'success': jnp.float32(2)})\n"
+        "    def reset(self, rng):\n"
+        "        return super().reset(rng).replace(info={'success': jnp.float32(0)})\n"
+        "@jax.custom_batching.custom_vmap\n"
+        "def rank(x):\n"
+        "    return x\n"
+        "@rank.def_vmap\n"
+        "def rank_of_a_batch(size, is_batched, x):\n"
+        "    return x - x.mean(), True\n"
+        "class Racing(Balance):\n"
+        "    def step(self, state, action):\n"
+        "        return state.replace(reward=rank(action[0]))\n"
     ),
     "my_env.yaml": "environment: my_env.py:Balance\n",
     "half_a_task.py": "class Docking(:\n",
