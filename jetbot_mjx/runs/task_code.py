@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 from jetbot_mjx.config import find_task_here, import_root, shipped_folder, source_file
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.durable import make_folders
 from jetbot_mjx.runs.run_dir import (
     read_bytes,
     read_text,
@@ -97,7 +98,9 @@ def collect_task_code(name: str) -> TaskCode | None:
     if source_file(root, module) is None:
         return None
     if sum(map(len, files.values())) > MAX_BYTES:
-        _say(f"the source of {name} is larger than {MAX_BYTES:,} bytes and is not stored in the run")
+        _say(
+            f"the source of {name} is larger than {MAX_BYTES:,} bytes and is not stored in the run"
+        )
         return None
     if late:
         _say(
@@ -121,7 +124,7 @@ def write_task_code(run_dir: Path, code: TaskCode) -> None:
     folder = run_dir / FOLDER
     with writing_to(folder):
         for path, content in code.files:
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            make_folders((folder / path).parent)
             write_bytes(folder / path, content)
         hashes = {path: hashlib.sha256(content).hexdigest() for path, content in code.files}
         # Write this file last: without it, the others count as not stored.
