@@ -11,7 +11,8 @@ observation's layout names those numbers, so that the rows can be matched betwee
 All later layers are taken over but for the policy's last one. A trained policy commands full speed
 almost everywhere, and there its noise changes nothing that it could learn from. Therefore the last
 layer's means are scaled by `MEAN_SCALE`, which changes how hard the policy steers and not where to,
-and the part that gives the width of its noise is that of a new policy. The optimizer starts from its initial state.
+and the part that gives the width of its noise is that of a new policy. The
+optimizer starts from its initial state.
 """
 
 from pathlib import Path
