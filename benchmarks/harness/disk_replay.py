@@ -38,8 +38,8 @@ _BY_PATH = (
 _ALL_SUBSETS = 10
 """Most operations of which all subsets are made."""
 
-_DRAWN = 2_000
-"""Subsets that are drawn where there are more operations."""
+_DRAWN, _DRAWN_OF_MANY = 20, 2_000
+"""Subsets that are drawn before a sync; of more operations than `_ALL_SUBSETS`."""
 
 _BLOCK = 512
 """Bytes that a disk writes as a whole."""
@@ -265,9 +265,10 @@ def _decode(text: str) -> bytes:
 def states(recording: Recording, rng: random.Random) -> Iterator[tuple[State, list[str]]]:
     """Make the states that a loss of power may leave, each once for what was confirmed before.
 
-    Before each sync, and at the end: all subsets of the operations that no sync covers, if they are
-    few. If not: all but one, all but two, and drawn ones. Besides, the state after each operation,
-    if all are on the disk, and with a last write of which the end is missing.
+    After each operation: all on the disk, and all with the end of the last write missing. Before
+    each sync, and at the end: of the operations since the sync before, all subsets if they are few,
+    else all but one, all but two and drawn ones, beside all and none of the earlier ones that no
+    sync covers; and drawn subsets of all that no sync covers.
 
     Args:
       recording: what `record` returned.
@@ -276,30 +277,32 @@ def states(recording: Recording, rng: random.Random) -> Iterator[tuple[State, li
     Yields:
       A state, and the names that were confirmed before.
     """
-    ops = recording.ops
-    made: set[tuple[str, int]] = set()
-    changes = [i for i, op in enumerate(ops) if op.kind in ("names", "write", "resize")]
+    ops, made = recording.ops, set[tuple[str, int]]()
     confirmed: list[str] = []
-    open_: list[int] = []
+    covered: list[int] = []
+    earlier: list[int] = []
+    window: list[int] = []
     for end in range(len(ops) + 1):
         op = ops[end] if end < len(ops) else None
-        for subset in _subsets(open_, op is None or op.kind == "sync", rng):
-            missing = set(open_) - set(subset)
-            kept = [ops[i] for i in changes if i < end and i not in missing]
-            for variant in (kept, _torn(kept)) if subset and subset[-1] == end - 1 else (kept,):
-                state = _build(variant, recording.folders)
-                key = _digest(state), len(confirmed)
-                if key not in made:
-                    made.add(key)
-                    yield state, list(confirmed)
+        is_end = op is None or op.kind == "sync"
+        for subset, is_torn in _subsets(earlier, window, rng) if is_end else _last(earlier, window):
+            kept = [ops[i] for i in sorted([*covered, *subset])]
+            state = _build(_torn(kept) if is_torn else kept, recording.folders)
+            key = _digest(state), len(confirmed)
+            if key not in made:
+                made.add(key)
+                yield state, list(confirmed)
         if op is None:
             return
         if op.kind == "confirm":
             confirmed.append(os.fsdecode(op.data))
         elif op.kind == "sync":
-            open_ = [i for i in open_ if i >= op.started or not _covers(op.node, ops[i])]
+            open_ = [*earlier, *window]
+            done = {i for i in open_ if i < op.started and _covers(op.node, ops[i])}
+            covered += sorted(done)
+            earlier, window = [i for i in open_ if i not in done], []
         else:
-            open_.append(end)
+            window.append(end)
 
 
 def _covers(node: int, op: Op) -> bool:
@@ -307,27 +310,37 @@ def _covers(node: int, op: Op) -> bool:
     return node == op.node if op.kind != "names" else node in {folder for folder, _, _ in op.names}
 
 
-def _subsets(open_: Sequence[int], at_sync: bool, rng: random.Random) -> Iterator[tuple[int, ...]]:
+_Subset = tuple[Sequence[int], bool]
+"""Numbers of the operations on the disk, and whether the end of the last one is missing."""
+
+
+def _last(earlier: Sequence[int], window: Sequence[int]) -> Iterator[_Subset]:
+    yield [*earlier, *window], False
+    yield [*earlier, *window], True
+
+
+def _subsets(
+    earlier: Sequence[int], window: Sequence[int], rng: random.Random
+) -> Iterator[_Subset]:
     """Yield which of the operations that no sync covers are on the disk, all of them first."""
-    yield tuple(open_)
-    if not at_sync:
-        return
-    if len(open_) <= _ALL_SUBSETS:
-        for size in range(len(open_)):
-            yield from itertools.combinations(open_, size)
-        return
-    for count in (1, 2):
-        for missing in itertools.combinations(open_, count):
-            yield tuple(i for i in open_ if i not in missing)
-    for _ in range(_DRAWN):
+    yield from _last(earlier, window)
+    if len(window) <= _ALL_SUBSETS:
+        sizes, drawn = range(len(window) + 1), _DRAWN
+    else:
+        sizes, drawn = (len(window), len(window) - 1, len(window) - 2), _DRAWN_OF_MANY
+    for size in sizes:
+        for part in itertools.combinations(window, size):
+            for before in (earlier, ()):
+                yield [*before, *part], False
+                yield [*before, *part], True
+    for _ in range(drawn):
         share = rng.random()
-        yield tuple(i for i in open_ if rng.random() < share)
+        yield [i for i in (*earlier, *window) if rng.random() < share], rng.random() < 0.5
 
 
 def _torn(ops: Sequence[Op]) -> list[Op]:
     """Return operations without the last block of their last write."""
-    last = ops[-1]
-    if last.kind != "write":
+    if not ops or (last := ops[-1]).kind != "write":
         return list(ops)
     return [*ops[:-1], last._replace(data=last.data[: (len(last.data) - 1) // _BLOCK * _BLOCK])]
 

@@ -237,7 +237,13 @@ class Row(NamedTuple):
     """What was lost in the first of them."""
 
 
-def replay(name: str, folder: Path, seed: int = 0, share: float = 1.0) -> Row:
+def replay(
+    name: str,
+    folder: Path,
+    seed: int = 0,
+    share: float = 1.0,
+    program: Sequence[str] = (str(Path(__file__).resolve()),),
+) -> Row:
     """Record a scenario, and read every state that a loss of power may leave.
 
     Args:
@@ -245,13 +251,14 @@ def replay(name: str, folder: Path, seed: int = 0, share: float = 1.0) -> Row:
       folder: an empty folder, for the recording and the states.
       seed: seed of the subsets that are drawn.
       share: the part of all states that is read, drawn by chance.
+      program: Python's arguments, which `--store` follows.
 
     Raises:
       UserError: the scenario could not be recorded.
     """
     recorded, rng = folder / "recorded", random.Random(seed)
     recorded.mkdir()
-    arguments = [str(Path(__file__).resolve()), "--store", name, "--folder", str(recorded)]
+    arguments = [*program, "--store", name, "--folder", str(recorded)]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
     recording = record(arguments, recorded, environment)
     count, failures = 0, []

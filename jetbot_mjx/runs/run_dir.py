@@ -407,7 +407,8 @@ def write_text(path: Path, text: str) -> None:
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically: it is complete or unchanged whenever process or power end.
 
-    After the call the disk holds it. Others may write the same file at the same time: the last one to complete it stays.
+    After the call the disk holds it. Others may write the same file at the same time: the last one
+    to complete it stays.
     """
     writer = f"{os.getpid()}-{threading.get_ident()}"
     unfinished = path.with_name(f".{path.name}.{writer}.unfinished")

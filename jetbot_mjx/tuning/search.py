@@ -12,12 +12,13 @@ has not used, and evaluated on the report's goals, which chose nothing.
 
 import contextlib
 import functools
+import sqlite3
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
