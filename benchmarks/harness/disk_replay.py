@@ -286,8 +286,9 @@ def states(recording: Recording, rng: random.Random) -> Iterator[tuple[State, li
         op = ops[end] if end < len(ops) else None
         is_end = op is None or op.kind == "sync"
         for subset, is_torn in _subsets(earlier, window, rng) if is_end else _last(earlier, window):
-            kept = [ops[i] for i in sorted([*covered, *subset])]
-            state = _build(_torn(kept) if is_torn else kept, recording.folders)
+            torn = max(subset, default=None) if is_torn else None
+            done = [_torn(ops[i]) if i == torn else ops[i] for i in sorted([*covered, *subset])]
+            state = _build(done, recording.folders)
             key = _digest(state), len(confirmed)
             if key not in made:
                 made.add(key)
@@ -298,9 +299,9 @@ def states(recording: Recording, rng: random.Random) -> Iterator[tuple[State, li
             confirmed.append(os.fsdecode(op.data))
         elif op.kind == "sync":
             open_ = [*earlier, *window]
-            done = {i for i in open_ if i < op.started and _covers(op.node, ops[i])}
-            covered += sorted(done)
-            earlier, window = [i for i in open_ if i not in done], []
+            now = {i for i in open_ if i < op.started and _covers(op.node, ops[i])}
+            covered += sorted(now)
+            earlier, window = [i for i in open_ if i not in now], []
         else:
             window.append(end)
 
@@ -338,11 +339,9 @@ def _subsets(
         yield [i for i in (*earlier, *window) if rng.random() < share], rng.random() < 0.5
 
 
-def _torn(ops: Sequence[Op]) -> list[Op]:
-    """Return operations without the last block of their last write."""
-    if not ops or (last := ops[-1]).kind != "write":
-        return list(ops)
-    return [*ops[:-1], last._replace(data=last.data[: (len(last.data) - 1) // _BLOCK * _BLOCK])]
+def _torn(op: Op) -> Op:
+    """Return a write without its last block."""
+    return op._replace(data=op.data[: (len(op.data) - 1) // _BLOCK * _BLOCK])
 
 
 def _build(ops: Sequence[Op], folders: Collection[int]) -> State:

