@@ -76,8 +76,8 @@ def store_run(folder: Path) -> None:
                 store.save(steps, {x: tree_at(steps, x) for x in _TREES}, {}, 0.5, _TREES[1:])
             confirm(f"checkpoint={steps}")
         metrics.close()
-        # The newest is moved, as if it was damaged, and written once more.
-        confirm("checkpoint=200")
+        # The newest is moved, as if it was damaged, and only the first is left.
+        confirm("checkpoint=0")
         set_aside(checkpoint_path(run, 300))
         with CheckpointStore(run, keep=2) as store:
             for steps in (300, 400):
