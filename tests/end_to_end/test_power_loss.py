@@ -44,18 +44,32 @@ BROKEN = {
     "the content of a file": ("files", "run_dir.os.fsync = lambda descriptor: None"),
     "the name of a file": ("files", "durable.sync = lambda path: None"),
     "the content of an export": ("export", "run_dir.sync_tree = lambda folder: None"),
+}
+
+BROKEN_TOO = {
     "the content of a checkpoint": ("run", "checkpoint_manager.sync_tree = lambda folder: None"),
     "the name of a checkpoint": ("run", "checkpoint_manager.sync = lambda folder: None"),
     "a line of metrics": ("run", "metrics.os.fsync = lambda descriptor: None"),
     "the end of a journal": ("study", "search._SyncedConnection = sqlite3.Connection"),
 }
+"""Of scenarios that import JAX."""
 
 
 @traced
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_missing_sync_is_found_out(tmp_path, name):
-    scenario, change = BROKEN[name]
-    program = tmp_path / "program.py"
+    assert lost_without_a_sync(tmp_path, *BROKEN[name]) > 0
+
+
+@traced
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BROKEN_TOO)
+def test_a_missing_sync_of_a_training_is_found_out(tmp_path, name):
+    assert lost_without_a_sync(tmp_path, *BROKEN_TOO[name]) > 0
+
+
+def lost_without_a_sync(folder, scenario, change):
+    program = folder / "program.py"
     program.write_text(
         "import sqlite3\n"
         "from benchmarks.reliability import power_loss\n"
@@ -64,8 +78,8 @@ def test_a_missing_sync_is_found_out(tmp_path, name):
         f"{change}\n"
         "power_loss.main()\n"
     )
-    share = 0.02 if scenario in ("run", "study") else 1
-    assert power_loss.replay(scenario, tmp_path, share=share, program=[str(program)]).lost > 0
+    share = 0.02 if scenario == "run" else 1
+    return power_loss.replay(scenario, folder, share=share, program=[str(program)]).lost
 
 
 def texts_of(ops, folders=(0,)):
