@@ -35,6 +35,7 @@ def _parser() -> cli.Parser:
     started = f"under srun, mpirun, or with {variables}"
     text = f"this is one of several processes that train one policy, {started}"
     cli.add_flag(parser, "--distributed", text)
+    cli.add_trust(parser)
     return parser
 
 
@@ -66,7 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not (options.resume or options.config):
         parser.error("name a configuration, as in `train jetbot`, or a run to --resume")
     startup.wake_driver()
-    config, run_dir = _config_and_folder(options)
+    with cli.trusting(options.trust):
+        config, run_dir = _config_and_folder(options)
     # Import the large modules while the GPU initialises, and load the programs during the rest.
     with startup.exit_on_interrupt():
         from jetbot_mjx import runs, training
@@ -86,7 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         startup.load_blas()
     with startup.exit_on_interrupt():
         from jetbot_mjx.training import Preemption, run
-    result = run(config, run_dir, programs, Preemption(config.preemption_notice), verbose=True)
+    stop = Preemption(config.preemption_notice)
+    with cli.trusting(options.trust):
+        result = run(config, run_dir, programs, stop, verbose=True)
     if is_primary():
         text = training.closing_message(result)
         runs.log_message(run_dir, text)

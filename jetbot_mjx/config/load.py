@@ -20,7 +20,9 @@ Overrides = Mapping[str, object] | Sequence[str]
 `section.key=value` as after `--set`."""
 
 
-def load_config(config: "str | Path | Config | None", overrides: Overrides = ()) -> Config:
+def load_config(
+    config: "str | Path | Config | None", overrides: Overrides = (), *, imports: bool = True
+) -> Config:
     """Read a configuration, apply overrides, and check the result.
 
     The module of `task.name` or `environment` is found beside the file, from now on in the whole
@@ -31,6 +33,7 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
         that differ from the defaults; or a `Config`. None: only defaults.
       overrides: the settings to change, such as `{"ppo.num_envs": 256}`; or a list of
         `section.key=value`, as after `--set`, the value read as YAML, of which the last one wins.
+      imports: whether its task or environment is to be imported, so that its module is found.
 
     Returns:
       The resolved configuration.
@@ -76,7 +79,7 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
             f"{name}: robot.sha256 = {shown(stored)} is not the hash of the model that was found,"
             f" {resolved.robot.sha256!r}: restore its files, or leave the hash out"
         )
-    if file is not None:
+    if file is not None and imports:
         find_task_beside(file, resolved.code.partition(":")[0])
     return resolved
 

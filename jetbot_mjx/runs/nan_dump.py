@@ -18,7 +18,7 @@ from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, PhysicsState, State
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import flatten
 from jetbot_mjx.runs.run_dir import parse_stored, read_bytes, write_bytes
-from jetbot_mjx.runs.task_code import stored_class
+from jetbot_mjx.runs.trust import trusted_class
 
 FOLDER = "nan_dumps"
 """Name of the folder of dumps in a run folder."""
@@ -85,6 +85,7 @@ def load_nan_dump(path: Path) -> StoredNanDump:
     Raises:
       NotFoundError: there is no such file.
       InvalidError: `save_nan_dump` did not write it.
+      UserError: its run names code that may not run, as for `require_trust`.
     """
     try:
         with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as stored:
@@ -94,7 +95,7 @@ def load_nan_dump(path: Path) -> StoredNanDump:
             raise InvalidError(f"{path} has the format {shown(about['format'])}, not {_FORMAT!r}")
         run_dir = Path(path).absolute().parent.parent
         config = parse_stored(about["config"], run_dir, "stored config")
-        own_class = stored_class(run_dir, config.code)
+        own_class = trusted_class(run_dir, config)
         template = _template(config, own_class)
         wanted = flatten(template)
         if wanted.keys() != arrays.keys():
@@ -126,7 +127,9 @@ def load_nan_dump(path: Path) -> StoredNanDump:
 
 def _template(config: Config, own_class: type | None) -> NanDump:
     """Return the shapes and dtypes of a dump of this configuration."""
-    env = envs.wrap_for_training(envs.make_env(config, own_class=own_class), config.task.episode_length)
+    env = envs.wrap_for_training(
+        envs.make_env(config, own_class=own_class), config.task.episode_length
+    )
     batched = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((1, 2), np.uint32))
     state: State = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batched)
     return NanDump(
@@ -147,9 +150,7 @@ class ReplayStep(NamedTuple):
     """Names of the arrays that are not finite."""
 
 
-def replay_nan_dump(
-    stored: StoredNanDump, env: JetBotEnv | AdaptedEnv
-) -> Iterator[ReplayStep]:
+def replay_nan_dump(stored: StoredNanDump, env: JetBotEnv | AdaptedEnv) -> Iterator[ReplayStep]:
     """Replay the recorded actions from the state in which the unroll began.
 
     Args:
