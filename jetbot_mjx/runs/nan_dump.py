@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +26,9 @@ FOLDER = "nan_dumps"
 
 MAX_DUMPS = 20
 """Largest number of dumps that a run saves; further ones would add no information."""
+
+_MOST_BYTES = 100_000_000
+"""Largest size of the arrays of a dump, which a compressed file of any size could ask for."""
 
 _FORMAT = "jetbot_mjx.nan_dump/1"
 
@@ -88,7 +92,10 @@ def load_nan_dump(path: Path) -> StoredNanDump:
       UserError: its run names code that may not run, as for `require_trust`.
     """
     try:
-        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as stored:
+        content = io.BytesIO(read_bytes(path))
+        if sum(one.file_size for one in zipfile.ZipFile(content).infolist()) > _MOST_BYTES:
+            raise InvalidError(f"{path} holds more than {_MOST_BYTES // 1_000_000} MB")
+        with np.load(content, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         about = json.loads(str(arrays.pop("about")))
         if about["format"] != _FORMAT:
