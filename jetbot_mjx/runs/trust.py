@@ -165,8 +165,11 @@ def check_links(run_dir: Path) -> None:
     """
     if _trusts.get() or run_dir.is_relative_to(_PACKAGE):
         return
-    inside = run_dir.resolve()
-    for path in (one for folder in (run_dir, *run_dir.glob("seed-*")) for one in _written(folder)):
+    # A comparison of seeds is written to the folder that holds them.
+    top = run_dir.parent if run_dir.name.startswith("seed-") else run_dir
+    folders = dict.fromkeys((top, run_dir, *run_dir.glob("seed-*")))
+    inside = top.resolve()
+    for path in (one for folder in folders for one in _written(folder)):
         if path.is_symlink() and not _target(path).is_relative_to(inside):
             raise UserError(
                 f"{shortened(path)} is a link that leads out of the run folder, to {_target(path)}:"
