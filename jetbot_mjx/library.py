@@ -82,10 +82,10 @@ def train(
         if resume is not None:
             run_dir = find_run(resume)
             config = find_run_config(run_dir)
-        elif run_dir is None:
-            run_dir = default_run_dir(_name(config))
+        assert config is not None
+        run_dir = default_run_dir(_name(config)) if run_dir is None else Path(run_dir)
         restart_clock()
-        return training.run(load_config(config, overrides), Path(run_dir), verbose=verbose)
+        return training.run(load_config(config, overrides), run_dir, verbose=verbose)
 
 
 @overload
@@ -283,7 +283,7 @@ def _name(config: str | Path | Config) -> Path:
 
 @contextlib.contextmanager
 def _ready(verbose: bool, trust: bool = False) -> Iterator[None]:
-    """Check that there is a device, and show progress and trust runs inside the context if asked to.
+    """Check that there is a device; show progress and trust runs inside the context if asked to.
 
     Raises:
       UserError: JAX has no usable device, or the device has too little memory.

@@ -42,13 +42,14 @@ def _parser() -> cli.Parser:
 def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
     with startup.exit_on_interrupt():
         from jetbot_mjx.runs import default_run_dir, find_run, find_run_config
-    resumed = find_run(options.resume) if options.resume else None
-    if resumed:
-        options.config = find_run_config(resumed)
+    if options.resume:
+        run_dir = find_run(options.resume)
+        options.config = find_run_config(run_dir)
+    else:
+        run_dir = options.run_dir or default_run_dir(options.config)
     given = {"seed": options.seed, "seeds": options.seeds, "init_from": options.init_from}
     overrides = [f"{key}={json.dumps(x)}" for key, x in given.items() if x is not None]
-    config = cli.config_of(options, *overrides)
-    return config, resumed or options.run_dir or default_run_dir(options.config)
+    return cli.config_of(options, *overrides), run_dir
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

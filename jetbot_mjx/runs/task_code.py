@@ -205,7 +205,11 @@ def stored_class(run_dir: Path, name: str, code: TaskCode, *, silent: bool = Fal
     is_here = is_task_here(module)
     place = Path.cwd() if is_here else import_root(module)
     on_disk = place is not None and source_file(place, module) is not None
-    is_same = on_disk and all(holds(place / path, text) for path, text in code.files)
+    is_same = (
+        place is not None
+        and on_disk
+        and all(holds(place / path, text) for path, text in code.files)
+    )
     if is_same and not is_here:
         return None
     # Import the stored files.
