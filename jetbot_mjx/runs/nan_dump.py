@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jetbot_mjx import envs
 from jetbot_mjx.agents import NanDump
 from jetbot_mjx.config import Config, ConfigError
-from jetbot_mjx import envs
 from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, PhysicsState, State
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import flatten

@@ -1,10 +1,10 @@
 """Store the source of one's own task or environment in the run folder, and import it from there.
 
 A policy is worth little without what it was trained in. When a training begins, the file of the
-module of task or environment and those of the modules that it imports from the same folder are copied to
-`task/` in the run folder, each with its SHA-256. Later commands import the stored files if the
-module cannot be found, or if its files differ from the stored ones. Tasks of this package and of
-installed packages are not stored, because their versions are.
+module of task or environment and those of the modules that it imports from the same folder are
+copied to `task/` in the run folder, each with its SHA-256. Later commands import the stored files
+if the module cannot be found, or if its files differ from the stored ones. Tasks of this package
+and of installed packages are not stored, because their versions are.
 
 The stored files are imported from memory, as they were checked: no other file in the run folder,
 and no bytecode, is ever imported. Afterwards their modules leave `sys.modules`, so that runs with
