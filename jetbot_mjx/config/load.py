@@ -25,15 +25,13 @@ def load_config(
 ) -> Config:
     """Read a configuration, apply overrides, and check the result.
 
-    The module of `task.name` or `environment` is found beside the file, from now on in the whole
-    process.
-
     Args:
       config: the name of a configuration that comes with the package; a YAML file with the settings
         that differ from the defaults; or a `Config`. None: only defaults.
       overrides: the settings to change, such as `{"ppo.num_envs": 256}`; or a list of
         `section.key=value`, as after `--set`, the value read as YAML, of which the last one wins.
-      imports: whether its task or environment is to be imported, so that its module is found.
+      imports: whether the module of `task.name` or `environment` is to be found beside the file,
+        from now on in the whole process.
 
     Returns:
       The resolved configuration.
