@@ -200,8 +200,8 @@ def stored_class(run_dir: Path, name: str, code: TaskCode, *, silent: bool = Fal
     # Never replace this package, whose compiled programs are cached by its own source.
     if code.module != module or module.partition(".")[0] == _PACKAGE:
         return None
-    # Prefer the module itself if nothing changed, so that its classes are the user's own. But in the
-    # current folder, which may be anyone's, there could be other files that it would import.
+    # Prefer the module itself if nothing changed, so that its classes are the user's own. But in
+    # the current folder, which may be anyone's, there could be other files that it would import.
     is_here = is_task_here(module)
     place = Path.cwd() if is_here else import_root(module)
     on_disk = place is not None and source_file(place, module) is not None
