@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             render_training_strip,
         )
     cli.prepare_device()
-    with cli.show_progress():
+    with cli.trusting(options.trust), cli.show_progress():
         if options.gallery:
             rendered = render_gallery(run, episodes=episodes or GALLERY_EPISODES)
         elif options.strip:
