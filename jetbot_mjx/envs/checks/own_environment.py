@@ -223,7 +223,7 @@ def _drive(env: AdaptedEnv, keys: UInt32[Array, "instances 2"]) -> dict[str, Arr
         flags = {"done": shown.done, SUCCESS: shown.metrics.get(SUCCESS, jnp.zeros(()))}
         return following, told | flags
 
-    first = jax.vmap(env.reset)(keys)
+    first: PyTree = jax.vmap(env.reset)(keys)
 
     def step(states: State, action: Array) -> tuple[State, dict[str, Array]]:
         return jax.vmap(step_one)(first, states, action)
