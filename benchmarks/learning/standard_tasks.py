@@ -4,9 +4,8 @@
 
 Each example is trained to its target with one seed and an empty compilation cache. Then
 Stable-Baselines3's PPO learns for `--limit` seconds, or to the same target, in Gymnasium's own
-environment of the task. Its hyperparameters are those of the RL Zoo (`hyperparams/ppo.yml`, commit
-22e3ff2) for the same environment of version 4, or 2 for the reacher. It has one environment and one
-thread, as there. Cart-pole swing-up has no equivalent in Gymnasium.
+environment of the task. Its hyperparameters are those of the RL Zoo (`hyperparams/ppo.yml`). It has
+one environment and one thread, as there. Cart-pole swing-up has no equivalent in Gymnasium.
 
 A return is the mean of deterministic episodes: 256 of an example, of which the time is part of the
 training's, and 20 with Stable-Baselines3, of which it is not.
