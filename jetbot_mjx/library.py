@@ -166,7 +166,7 @@ def render(
     Args:
       run: a run or checkpoint, named as for `evaluate`.
       which: the checkpoint of a run: `"best"`, `"last"` or a number of steps.
-      episodes: the number of goals, from the first on (default: 20, of a gallery 4); in an
+      episodes: the number of goals, from the first on (default: 8, of a gallery 4); in an
         `environment` that of episodes (default: 3).
       goals: these of the fixed goals, such as `[3, 17]`, in place of `episodes`.
       many: that many robots in one scene, each with its own goal.

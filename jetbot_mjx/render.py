@@ -7,10 +7,13 @@ image of an untrained, an early and a trained policy.
 """
 
 import argparse
+import re
 from collections.abc import Sequence
 
 from jetbot_mjx import cli, startup
 from jetbot_mjx.evaluation import REPORT_GOALS
+
+_SIDES = (64, 4096)  # [pixels] smallest and largest side of a video
 
 
 def _parser() -> cli.Parser:
@@ -31,7 +34,21 @@ def _parser() -> cli.Parser:
     gallery = "the first, the middle and the last checkpoint of the run side by side"
     cli.add_flag(parser, "--gallery", gallery)
     cli.add_flag(parser, "--strip", "one image of an untrained, an early and a trained policy")
+    size = "width and height of the video in pixels (default: 1280x720, with --gallery 1280x480)"
+    parser.add_argument("--size", type=_size, metavar="WxH", help=size)
     return parser
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Parse an argument that is a width and a height, which videos need to be even."""
+    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
+    size = (int(found[1]), int(found[2])) if found else (0, 0)
+    if any(side % 2 or not _SIDES[0] <= side <= _SIDES[1] for side in size):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a size: give two even numbers from {_SIDES[0]} to {_SIDES[1]}, such"
+            " as 1280x720"
+        )
+    return size
 
 
 def _check(parser: cli.Parser, options: argparse.Namespace) -> None:
@@ -45,6 +62,7 @@ def _check(parser: cli.Parser, options: argparse.Namespace) -> None:
         (options.strip and options.gallery, "--strip", "--gallery"),
         (options.strip and options.goals, "--goals", "--strip"),
         (options.strip and options.episodes, "--episodes", "--strip"),
+        (options.strip and options.size, "--size", "--strip"),
     ):
         if both:
             parser.error(f"{option}: cannot be combined with {other}")
@@ -63,6 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     _check(parser, options)
     run, which, episodes = cli.find_policy(options.run), options.which, options.episodes
+    size = options.size
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import (
             GALLERY_EPISODES,
@@ -74,13 +93,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.prepare_device()
     with cli.show_progress():
         if options.gallery:
-            rendered = render_gallery(run, episodes=episodes or GALLERY_EPISODES)
+            rendered = render_gallery(run, episodes=episodes or GALLERY_EPISODES, size=size)
         elif options.strip:
             rendered = render_training_strip(run, robots=options.many or 16)
         elif options.many:
-            rendered = render_many(run, robots=options.many, which=which)
+            rendered = render_many(run, robots=options.many, which=which, size=size)
         else:
-            rendered = render_run(run, episodes=episodes, goals=options.goals, which=which)
+            rendered = render_run(
+                run, episodes=episodes, goals=options.goals, which=which, size=size
+            )
     cli.tell(rendered.describe())
     return 0
 
