@@ -101,11 +101,9 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
           run_dir: the run folder, which must exist.
           keep: the number of latest checkpoints to keep, besides the first and the best.
         """
-        self._scores = {
-            step: stored_score(run_dir, step) for step in checkpoint_steps(run_dir)
-        }
+        self._scores = {step: stored_score(run_dir, step) for step in checkpoint_steps(run_dir)}
         self._keep = keep
-        self._manager: "ocp.CheckpointManager | None" = None
+        self._manager: ocp.CheckpointManager | None = None
         self._log = contextlib.ExitStack()
         self._folder = (run_dir / FOLDER).absolute()
         self._clear_deleted()

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jetbot_mjx import envs
 from jetbot_mjx.agents import NanDump
 from jetbot_mjx.config import Config, ConfigError
-from jetbot_mjx import envs
 from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, PhysicsState, State
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import flatten
@@ -126,7 +126,9 @@ def load_nan_dump(path: Path) -> StoredNanDump:
 
 def _template(config: Config, own_class: type | None) -> NanDump:
     """Return the shapes and dtypes of a dump of this configuration."""
-    env = envs.wrap_for_training(envs.make_env(config, own_class=own_class), config.task.episode_length)
+    env = envs.wrap_for_training(
+        envs.make_env(config, own_class=own_class), config.task.episode_length
+    )
     batched = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((1, 2), np.uint32))
     state: State = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batched)
     return NanDump(
@@ -147,9 +149,7 @@ class ReplayStep(NamedTuple):
     """Names of the arrays that are not finite."""
 
 
-def replay_nan_dump(
-    stored: StoredNanDump, env: JetBotEnv | AdaptedEnv
-) -> Iterator[ReplayStep]:
+def replay_nan_dump(stored: StoredNanDump, env: JetBotEnv | AdaptedEnv) -> Iterator[ReplayStep]:
     """Replay the recorded actions from the state in which the unroll began.
 
     Args:

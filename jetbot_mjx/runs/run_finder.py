@@ -117,7 +117,7 @@ def find_run_config(run_dir: Path) -> Path:
 
 
 def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[DamagedRunError]]:
-    """Return the runs in the subfolders of a folder, the latest first, and the errors of the others.
+    """Return the runs in the subfolders of a folder, the latest first, and the others' errors.
 
     Args:
       root: the folder, which may be missing.

@@ -1,10 +1,10 @@
 """Store the source of one's own task or environment in the run folder, and import it from there.
 
 A policy is worth little without what it was trained in. When a training begins, the file of the
-module of task or environment and those of the modules that it imports from the same folder are copied to
-`task/` in the run folder, each with its SHA-256. Later commands import the stored files if the
-module cannot be found, or if its files differ from the stored ones. Tasks of this package and of
-installed packages are not stored, because their versions are.
+module of task or environment and those of the modules that it imports from the same folder are
+copied to `task/` in the run folder, each with its SHA-256. Later commands import the stored files
+if the module cannot be found, or if its files differ from the stored ones. Tasks of this package
+and of installed packages are not stored, because their versions are.
 
 For the time of the import, the stored folder comes first in `sys.path`; afterwards its modules
 leave `sys.modules`, so that runs with different sources of one name can be used in one process. So
@@ -97,7 +97,9 @@ def collect_task_code(name: str) -> TaskCode | None:
     if source_file(root, module) is None:
         return None
     if sum(map(len, files.values())) > MAX_BYTES:
-        _say(f"the source of {name} is larger than {MAX_BYTES:,} bytes and is not stored in the run")
+        _say(
+            f"the source of {name} is larger than {MAX_BYTES:,} bytes and is not stored in the run"
+        )
         return None
     if late:
         _say(

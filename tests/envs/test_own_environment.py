@@ -10,6 +10,7 @@ from helpers.command_modules import train
 from jetbot_mjx import cli
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import make_env
+from jetbot_mjx.envs.checks import own_environment
 from jetbot_mjx.envs.checks.own_environment import (
     ENVIRONMENT_CHECKS,
     check_environment,
@@ -94,9 +95,19 @@ def type_(tmp_path, monkeypatch, capfd):
     return type_
 
 
+@pytest.fixture
+def resets_are_slow_after_10_ms(monkeypatch):
+    """However fast the machine is, a reset that counts to a million is slow."""
+    monkeypatch.setattr(own_environment, "_LONGEST_RESET", 0.01)
+
+
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_mistake_is_one_line_and_nothing_is_written(type_, name):
-    line = type_(f"environment: helpers.broken_environments:{name}\n")
+def test_a_mistake_is_one_line_and_nothing_is_written(type_, name, request):
+    if name == "ResetsSlowly":
+        request.getfixturevalue("resets_are_slow_after_10_ms")
+    # Few steps, so that a training which should not have begun ends.
+    few = "ppo: {num_timesteps: 1000}\n"
+    line = type_(f"environment: helpers.broken_environments:{name}\n{few}")
     assert line.startswith("error: ")
     assert f"environment = 'helpers.broken_environments:{name}'" in line
     assert BROKEN[name] in line

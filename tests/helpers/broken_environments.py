@@ -107,7 +107,7 @@ class NamesAMetricAnewEachTime(Point):
 class ResetsSlowly(Point):
     def reset(self, rng):
         first = super().reset(rng)
-        x = jax.lax.fori_loop(0, 30_000_000, lambda i, x: jnp.sin(x + 0.1), first.obs[0])
+        x = jax.lax.fori_loop(0, 1_000_000, lambda i, x: jnp.sin(x + 0.1), first.obs[0])
         return first.replace(obs=first.obs.at[0].set(x))
 
 

@@ -5,9 +5,9 @@ import json
 import sys
 import textwrap
 
-from helpers import gliding
 import pytest
 
+from helpers import gliding
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.mujoco_env import MujocoJetBot
