@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Unpack, overload
 from jetbot_mjx import deployment, evaluation, runs, training, tuning, viewers
 from jetbot_mjx.config import Config, Overrides, load_config
 from jetbot_mjx.devices import require_device
-from jetbot_mjx.errors import InvalidError, UserError, check_count, ran_out
+from jetbot_mjx.errors import InvalidError, UserError, check_count, check_size, ran_out
 from jetbot_mjx.runs import default_run_dir, find_run, find_run_config, seed_folders
 from jetbot_mjx.terminal import restart_clock, show_progress
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 _FITTING = {
     "strip": ("many",),
-    "gallery": ("episodes",),
-    "many": ("which",),
-    "goals": ("which",),
-    "episodes": ("which",),
+    "gallery": ("episodes", "size"),
+    "many": ("which", "size"),
+    "goals": ("which", "size"),
+    "episodes": ("which", "size"),
 }
 """The arguments of `render` that say what to render, with those that may be given beside them."""
 
@@ -159,6 +159,7 @@ def render(
     many: int | None = None,
     gallery: bool = False,
     strip: bool = False,
+    size: tuple[int, int] | None = None,
     verbose: bool = False,
 ) -> "viewers.Rendered":
     """Render a policy that drives to the fixed goals: a video, a GIF and a plot.
@@ -173,6 +174,8 @@ def render(
       gallery: whether to render the first, the middle and the last checkpoint side by side.
       strip: whether to render an image of an untrained, an early and a trained policy; `many` is
         then the number of robots of each.
+      size: the width and height of the video, two even numbers of pixels (default: 1280 by 720, of
+        a gallery 1280 by 480).
       verbose: whether to show the progress.
 
     Returns:
@@ -189,7 +192,10 @@ def render(
         "goals": goals is not None,
         "episodes": episodes is not None,
         "which": which != "best",
+        "size": size is not None,
     }
+    if size is not None:
+        check_size(size)
     chosen = next((name for name in _FITTING if given[name]), "episodes")
     for name in given:
         if given[name] and name not in (chosen, *_FITTING[chosen]):
@@ -199,11 +205,13 @@ def render(
             return viewers.render_training_strip(find_run(run), robots=16 if many is None else many)
         if gallery:
             return viewers.render_gallery(
-                find_run(run), episodes=4 if episodes is None else episodes
+                find_run(run), episodes=4 if episodes is None else episodes, size=size
             )
         if many is not None:
-            return viewers.render_many(find_run(run), robots=many, which=which)
-        return viewers.render_run(find_run(run), episodes=episodes, goals=goals, which=which)
+            return viewers.render_many(find_run(run), robots=many, which=which, size=size)
+        return viewers.render_run(
+            find_run(run), episodes=episodes, goals=goals, which=which, size=size
+        )
 
 
 def tune(

@@ -11,16 +11,15 @@ import re
 from collections.abc import Sequence
 
 from jetbot_mjx import cli, startup
+from jetbot_mjx.errors import InvalidError, check_size
 from jetbot_mjx.evaluation import REPORT_GOALS
-
-_SIDES = (64, 4096)  # [pixels] smallest and largest side of a video
 
 
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx render", description=__doc__)
     cli.add_checkpoint_arguments(parser)
     group = parser.add_mutually_exclusive_group()
-    defaults = "default: 20; 4 with --gallery; 3 in an environment"
+    defaults = "default: 8; 4 with --gallery; 3 in an environment"
     first = f"drive to the first N of the fixed goals ({defaults})"
     cli.add_count(group, "--episodes", first, most=REPORT_GOALS)
     group.add_argument(
@@ -34,20 +33,21 @@ def _parser() -> cli.Parser:
     gallery = "the first, the middle and the last checkpoint of the run side by side"
     cli.add_flag(parser, "--gallery", gallery)
     cli.add_flag(parser, "--strip", "one image of an untrained, an early and a trained policy")
-    size = "width and height of the video in pixels (default: 1280x720, with --gallery 1280x480)"
+    size = "width and height of the video in pixels (default: 1280x720; 1280x480 with --gallery)"
     parser.add_argument("--size", type=_size, metavar="WxH", help=size)
     return parser
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Parse an argument that is a width and a height, which videos need to be even."""
-    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
-    size = (int(found[1]), int(found[2])) if found else (0, 0)
-    if any(side % 2 or not _SIDES[0] <= side <= _SIDES[1] for side in size):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a size: give two even numbers from {_SIDES[0]} to {_SIDES[1]}, such"
-            " as 1280x720"
-        )
+    """Parse an argument that is the width and height of a video."""
+    found = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
+    if not found:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size: write it as in 1280x720")
+    size = (int(found[1]), int(found[2]))
+    try:
+        check_size(size)
+    except InvalidError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
     return size
 
 

@@ -27,7 +27,7 @@ from jetbot_mjx.viewers.video import (
     write_mp4,
 )
 
-SIDE, FPS = 120, 10.0
+WIDTH, HEIGHT, FPS = 240, 120, 10.0
 DT = 1 / 60
 
 
@@ -54,7 +54,7 @@ def drive(world_env):
 
 @pytest.fixture(scope="module")
 def renderer(world_env, needs_opengl):
-    with VideoRenderer(world_env, SIDE, FPS) as renderer:
+    with VideoRenderer(world_env, (WIDTH, HEIGHT), FPS) as renderer:
         yield renderer
 
 
@@ -115,7 +115,7 @@ def test_goal_time_distance_and_outcome_are_written_in(renderer, drive, written,
     assert written[:2] == ["goal 7 0.00 s", "0.58 m to go"]
     assert written[-3:] == ["goal 7 0.50 s", "0.30 m to go", outcome]
     assert written.count(outcome) == 1
-    assert frames[0].shape == (SIDE, 2 * SIDE, 3)
+    assert frames[0].shape == (HEIGHT, WIDTH, 3)
     # Real time, and then it stands for a while.
     assert len(frames) == 1 + 0.5 * FPS + round(video.HOLD_SECONDS * FPS)
     assert all(np.array_equal(frames[5], frame) for frame in frames[6:])
@@ -125,8 +125,8 @@ def test_finished_robots_stop_while_the_others_drive(renderer, drive, written):
     short, long = drive((0.3, 0.0), (0.4, 0.0)), drive((-0.9, 0.0), (0.4, 0.0), reached=False)
     frames = list(renderer.render_side_by_side([("0 steps", short), ("9 steps", long)]))
     assert len(frames) == 1 + 0.9 * FPS + round(video.HOLD_SECONDS * FPS)
-    assert frames[0].shape == (SIDE, 2 * SIDE, 3)
-    left, right = ([frame[:, at : at + SIDE] for frame in frames] for at in (0, SIDE))
+    assert frames[0].shape == (HEIGHT, 2 * WIDTH, 3)
+    left, right = ([frame[:, at : at + WIDTH] for frame in frames] for at in (0, WIDTH))
     assert all(np.array_equal(left[3], panel) for panel in left[4:])
     for before, after in itertools.pairwise(right[:10]):
         assert not np.array_equal(before, after)
@@ -198,7 +198,7 @@ def test_what_a_policy_sees_is_in_the_upper_left_corner(
     qpos = jnp.asarray(one.qpos[0])
     seen = np.asarray(camera.render(camera.pose(qpos[QPOS_XYZ], qpos[QPOS_QUAT]), one.markers))
     assert ((seen[..., 0] > 90) & (seen[..., 1] < 40)).any()  # the cube
-    with VideoRenderer(seeing_env, SIDE, FPS) as renderer:
+    with VideoRenderer(seeing_env, (WIDTH, HEIGHT), FPS) as renderer:
         frame = next(renderer.render_episode(one))
         margin, border, square = round(0.03 * SIDE), 2, 2
         inner = frame[margin + border :, margin + border :][: 12 * square, : 16 * square]
