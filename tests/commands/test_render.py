@@ -119,13 +119,13 @@ def names(folder):
 
 
 def test_rendering_writes_a_video_a_gif_and_a_plot(run_copy, needs_opengl, coarse, capsys):
-    assert render.main([str(run_copy), "--episodes", "2", "--size", "960x80"]) == 0
+    assert render.main([str(run_copy), "--episodes", "2", "--size", "720x80"]) == 0
     (folder,) = (run_copy / "videos").iterdir()
     film = iio.imread(folder / "episodes-2.mp4", plugin="pyav")
-    assert film.shape[1:] == (80, 960, 3)
+    assert film.shape[1:] == (80, 720, 3)
     assert film.shape[0] > 8
-    assert np.abs(film[0].astype(int) - film[5]).mean() > 1  # it moves
-    assert iio.imread(folder / "episodes-2.gif").shape[1:] == (53, 640, 3)
+    assert np.abs(film[0].astype(int) - film[5]).max() > 50  # it moves
+    assert iio.imread(folder / "episodes-2.gif").shape[1:] == (71, 640, 3)
     assert iio.imread(folder / "trajectories-2.png").shape[0] > 400
     shown = capsys.readouterr().out
     for name in ("episodes-2.mp4", "episodes-2.gif", "trajectories-2.png"):
@@ -183,7 +183,7 @@ def test_goals_are_written_as_indices_and_ranges(text, goals, name):
         (["--size", "1280x720p"], "--size: '1280x720p' is not a size"),
         (
             ["--size", "1280x719"],
-            "--size: size = 1280x719 is wrong: it should be two even numbers from 64 to 4096, as in",
+            "--size: size = 1280x719 is wrong: it should be two even numbers from 64 to 4096",
         ),
         (["--size", "62x720"], "--size: size = 62x720 is wrong"),
         (["--size", "1280x4098"], "--size: size = 1280x4098 is wrong"),

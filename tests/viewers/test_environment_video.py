@@ -9,7 +9,7 @@ from helpers import point_mass
 from jetbot_mjx import library, training
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers.environment_video import view_of
-from jetbot_mjx.viewers.video import FPS, HOLD_SECONDS
+from jetbot_mjx.viewers.video import FADE_FRAMES, FPS, HOLD_SECONDS
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def test_episodes_are_rendered_in_real_time(folder, with_opengl):
     assert rendered.describe().splitlines()[0].endswith("in the mean of 1 episode")
     frames = iio.imread(rendered.files["video"])
     seconds = 16 * point_mass.DT
-    assert len(frames) == round(seconds * FPS) + round(HOLD_SECONDS * FPS) + 1
+    assert len(frames) == round(seconds * FPS) + round(HOLD_SECONDS * FPS) + 1 + FADE_FRAMES
     assert frames[0].shape == (96, 160, 3)
     # The point is red, and it is to be seen.
     red = frames[0].astype(int)
