@@ -174,8 +174,7 @@ def render(
       gallery: whether to render the first, the middle and the last checkpoint side by side.
       strip: whether to render an image of an untrained, an early and a trained policy; `many` is
         then the number of robots of each.
-      size: the width and height of the video, two even numbers of pixels (default: 1280 by 720, of
-        a gallery 1280 by 480).
+      size: width and height of the video [pixels] (default: 1280, 720; of a gallery 1280, 480).
       verbose: whether to show the progress.
 
     Returns:
@@ -194,24 +193,22 @@ def render(
         "which": which != "best",
         "size": size is not None,
     }
-    if size is not None:
-        check_size(size)
     chosen = next((name for name in _FITTING if given[name]), "episodes")
     for name in given:
         if given[name] and name not in (chosen, *_FITTING[chosen]):
             raise InvalidError(f"render: {chosen} and {name} exclude each other")
+    if size is not None:
+        check_size(size)
     with _ready(verbose):
+        path = find_run(run)
         if strip:
-            return viewers.render_training_strip(find_run(run), robots=16 if many is None else many)
+            return viewers.render_training_strip(path, robots=16 if many is None else many)
         if gallery:
-            return viewers.render_gallery(
-                find_run(run), episodes=4 if episodes is None else episodes, size=size
-            )
+            episodes = 4 if episodes is None else episodes
+            return viewers.render_gallery(path, episodes=episodes, size=size)
         if many is not None:
-            return viewers.render_many(find_run(run), robots=many, which=which, size=size)
-        return viewers.render_run(
-            find_run(run), episodes=episodes, goals=goals, which=which, size=size
-        )
+            return viewers.render_many(path, robots=many, which=which, size=size)
+        return viewers.render_run(path, episodes=episodes, goals=goals, which=which, size=size)
 
 
 def tune(

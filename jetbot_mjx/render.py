@@ -7,11 +7,9 @@ image of an untrained, an early and a trained policy.
 """
 
 import argparse
-import re
 from collections.abc import Sequence
 
 from jetbot_mjx import cli, startup
-from jetbot_mjx.errors import InvalidError, check_size
 from jetbot_mjx.evaluation import REPORT_GOALS
 
 
@@ -34,21 +32,8 @@ def _parser() -> cli.Parser:
     cli.add_flag(parser, "--gallery", gallery)
     cli.add_flag(parser, "--strip", "one image of an untrained, an early and a trained policy")
     size = "width and height of the video in pixels (default: 1280x720; 1280x480 with --gallery)"
-    parser.add_argument("--size", type=_size, metavar="WxH", help=size)
+    parser.add_argument("--size", type=cli.size, metavar="WxH", help=size)
     return parser
-
-
-def _size(text: str) -> tuple[int, int]:
-    """Parse an argument that is the width and height of a video."""
-    found = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
-    if not found:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size: write it as in 1280x720")
-    size = (int(found[1]), int(found[2]))
-    try:
-        check_size(size)
-    except InvalidError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return size
 
 
 def _check(parser: cli.Parser, options: argparse.Namespace) -> None:
@@ -80,8 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     _check(parser, options)
-    run, which, episodes = cli.find_policy(options.run), options.which, options.episodes
-    size = options.size
+    run, which, size = cli.find_policy(options.run), options.which, options.size
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import (
             GALLERY_EPISODES,
@@ -93,14 +77,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.prepare_device()
     with cli.show_progress():
         if options.gallery:
-            rendered = render_gallery(run, episodes=episodes or GALLERY_EPISODES, size=size)
+            rendered = render_gallery(run, episodes=options.episodes or GALLERY_EPISODES, size=size)
         elif options.strip:
             rendered = render_training_strip(run, robots=options.many or 16)
         elif options.many:
             rendered = render_many(run, robots=options.many, which=which, size=size)
         else:
             rendered = render_run(
-                run, episodes=episodes, goals=options.goals, which=which, size=size
+                run, episodes=options.episodes, goals=options.goals, which=which, size=size
             )
     cli.tell(rendered.describe())
     return 0

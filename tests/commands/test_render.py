@@ -274,6 +274,11 @@ def test_a_gallery_has_a_video_an_animation_and_a_sheet(run_copy, needs_opengl, 
     assert list(rendered.successes) == [0, 32_768, 65_536]
 
 
+def test_the_smallest_gallery_is_rendered(run_copy, needs_opengl, coarse):
+    rendered = render_gallery(run_copy, episodes=1, size=(64, 64))
+    assert iio.imread(rendered.files["video"], plugin="pyav").shape[1:] == (64, 60, 3)
+
+
 def test_one_checkpoint_makes_no_gallery(run_copy):
     with pytest.raises(UserError, match="is one checkpoint: give the run folder that contains it"):
         render_gallery(run_copy / "checkpoints" / f"{65_536:012}")

@@ -156,6 +156,22 @@ def test_the_edges_of_shadows_are_fine(renderer):
     assert width / model.vis.quality.shadowsize < 0.004  # [m]; a pixel of the chase view is 3 mm
 
 
+def test_the_floor_does_not_shade_itself(world_env, needs_opengl):
+    """Seven metres of it: where nothing stands, shadows add no edges."""
+    camera = mujoco.MjvCamera()
+    camera.azimuth, camera.elevation, camera.distance = 0.0, -50.0, 7.0
+    model = offscreen.with_metre_grid(world_env.mj_model)
+
+    def edges(frame):
+        return np.abs(np.diff(frame.astype(int).sum(axis=-1), axis=1))
+
+    with offscreen.Renderer(model, width=320, height=320) as renderer:
+        draw = functools.partial(renderer.frame, model.qpos0, {"goal": (0, 0, -9)}, camera)
+        added = np.abs(edges(draw()) - edges(draw(shadows=False)))
+    added[140:200, 140:180] = 0  # the robot
+    assert (added > 30).sum() < 10
+
+
 def test_text_and_inset_stay_above_what_happens(world_env, drive, needs_opengl):
     """Their pixels are those that differ from the bare view, the narrowest of a gallery."""
     one = drive((1.5, 1.5), (-1.0, -0.5), number=1023, reached=False)
