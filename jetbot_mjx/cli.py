@@ -442,6 +442,22 @@ def add_checkpoint_arguments(
         metavar="best|last|STEPS",
         help="which checkpoint of a run folder (default: best)",
     )
+    add_trust(parser)
+
+
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--trust`."""
+    text = (
+        "run the code that the run names, also if no training of yours on this machine has run it"
+    )
+    add_flag(parser, "--trust", text)
+
+
+def trusting(asked: bool) -> contextlib.AbstractContextManager[None]:
+    """Run the code that runs name inside the context, whoever wrote it, if `--trust` was given."""
+    from jetbot_mjx.runs import trusting
+
+    return trusting(asked)
 
 
 def add_config_arguments(

@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             render_training_strip,
         )
     cli.prepare_device()
-    with cli.show_progress():
+    with cli.trusting(options.trust), cli.show_progress():
         if options.gallery:
             rendered = render_gallery(run, episodes=options.episodes or GALLERY_EPISODES, size=size)
         elif options.strip:

@@ -20,6 +20,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" / "tests"))
 # Ours alone whatever the umask, or the commands would not use it.
 Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).mkdir(mode=0o700, parents=True, exist_ok=True)
+# What trainings record of the code that they ran is not the user's either.
+os.environ.setdefault("XDG_STATE_HOME", str(ROOT / ".cache" / "state"))
 # Small programs too: a process of the tests compiles a hundred of them before it begins.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 if os.environ["JAX_PLATFORMS"] == "cpu":

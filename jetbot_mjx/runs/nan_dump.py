@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -18,13 +19,16 @@ from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, PhysicsState, State
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import flatten
 from jetbot_mjx.runs.run_dir import parse_stored, read_bytes, write_bytes
-from jetbot_mjx.runs.task_code import stored_class
+from jetbot_mjx.runs.trust import trusted_class
 
 FOLDER = "nan_dumps"
 """Name of the folder of dumps in a run folder."""
 
 MAX_DUMPS = 20
 """Largest number of dumps that a run saves; further ones would add no information."""
+
+_MOST_BYTES = 100_000_000
+"""Largest size of the arrays of a dump, which a compressed file of any size could ask for."""
 
 _FORMAT = "jetbot_mjx.nan_dump/1"
 
@@ -85,16 +89,20 @@ def load_nan_dump(path: Path) -> StoredNanDump:
     Raises:
       NotFoundError: there is no such file.
       InvalidError: `save_nan_dump` did not write it.
+      UserError: its run names code that may not run, as for `require_trust`.
     """
     try:
-        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as stored:
+        content = io.BytesIO(read_bytes(path))
+        if sum(one.file_size for one in zipfile.ZipFile(content).infolist()) > _MOST_BYTES:
+            raise InvalidError(f"{path} holds more than {_MOST_BYTES // 1_000_000} MB")
+        with np.load(content, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         about = json.loads(str(arrays.pop("about")))
         if about["format"] != _FORMAT:
             raise InvalidError(f"{path} has the format {shown(about['format'])}, not {_FORMAT!r}")
         run_dir = Path(path).absolute().parent.parent
         config = parse_stored(about["config"], run_dir, "stored config")
-        own_class = stored_class(run_dir, config.code)
+        own_class = trusted_class(run_dir, config)
         template = _template(config, own_class)
         wanted = flatten(template)
         if wanted.keys() != arrays.keys():

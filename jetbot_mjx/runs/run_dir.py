@@ -32,7 +32,7 @@ from jetbot_mjx.config import (
     register,
 )
 from jetbot_mjx.envs import LIBRARIES, installed_version
-from jetbot_mjx.errors import UserError, clipped, os_errors
+from jetbot_mjx.errors import UserError, clipped, os_errors, shown
 
 try:
     import fcntl
@@ -134,9 +134,13 @@ def parse_stored(values: Mapping[str, object], run_dir: Path, source: str) -> Co
       source: description of their origin for error messages.
 
     Raises:
-      ConfigError: the settings are damaged.
+      ConfigError: the settings are damaged, or name a robot outside of the run.
       DamagedRunError: the model's files are not those that the training stored.
     """
+    robot = values.get("robot")
+    name = robot.get("file") if isinstance(robot, Mapping) else None
+    if isinstance(name, str) and name != Path(name).name:
+        raise ConfigError(f"{source}: robot.file = {shown(name)}: a run stores no path, but a name")
     config = parse_config(values, source)
     if isinstance(config.robot, MjcfRobotConfig):
         _read_model(run_dir, config.robot)

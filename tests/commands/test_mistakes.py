@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 
 import jetbot_mjx
+from helpers.damage import damage_about
 from jetbot_mjx import __main__ as entry
 from jetbot_mjx import cli
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import TaskCode, write_task_code
 from jetbot_mjx.terminal import progress
 
 PAGE = Path(__file__).parents[2] / "docs" / "mistakes.md"
@@ -92,11 +94,25 @@ def home(tmp_path_factory, smoke_run):
     for name in ("mine", "damaged"):
         shutil.copytree(smoke_run, folder / "runs" / name)
     shutil.copytree(smoke_run, folder / "runs" / "cut")
+    for name in ("theirs", "linked"):
+        shutil.copytree(smoke_run, folder / "runs" / name)
+    (folder / "runs" / "linked" / "policy").symlink_to(folder / "runs" / "other")
+    write_their_task(folder / "runs" / "theirs")
     cut = folder / "runs" / "cut" / "config.yaml"
     cut.write_text(cut.read_text()[:500])
     for path in (folder / "runs" / "damaged" / "checkpoints").glob("*/policy/**/d/*"):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     return folder
+
+
+def write_their_task(run_dir):
+    """Change a run to one of a task that its folder stores."""
+    write_task_code(run_dir, TaskCode("their_task", (("their_task.py", b"raise AssertionError"),)))
+    change = damage_about(lambda about: about["config"]["task"].update(name="their_task:Task"))
+    for checkpoint in (run_dir / "checkpoints").iterdir():
+        change(checkpoint)
+    config = run_dir / "config.yaml"
+    config.write_text(config.read_text().replace("jetbot_mjx:GoalTask", "their_task:Task"))
 
 
 @pytest.fixture
