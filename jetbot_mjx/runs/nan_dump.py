@@ -18,6 +18,7 @@ from jetbot_mjx.config import Config, ConfigError
 from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, PhysicsState, State
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import flatten
+from jetbot_mjx.runs.durable import make_folders
 from jetbot_mjx.runs.run_dir import parse_stored, read_bytes, write_bytes
 from jetbot_mjx.runs.trust import trusted_class
 
@@ -66,7 +67,7 @@ def save_nan_dump(run_dir: Path, config: Config, env_steps: int, nan_dump: NanDu
       OSError: the file cannot be written.
     """
     folder = run_dir / FOLDER
-    folder.mkdir(exist_ok=True)
+    make_folders(folder)
     path = folder / f"{env_steps:012d}.npz"
     if len(list(folder.glob("*.npz"))) >= MAX_DUMPS and not path.exists():
         return None

@@ -36,6 +36,7 @@ from jetbot_mjx.config import (
     source_file,
 )
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.durable import make_folders
 from jetbot_mjx.runs.run_dir import (
     read_bytes,
     read_text,
@@ -133,7 +134,7 @@ def write_task_code(run_dir: Path, code: TaskCode) -> None:
     folder = run_dir / FOLDER
     with writing_to(folder):
         for path, content in code.files:
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            make_folders((folder / path).parent)
             write_bytes(folder / path, content)
         hashes = {path: hashlib.sha256(content).hexdigest() for path, content in code.files}
         # Write this file last: without it, the others count as not stored.
