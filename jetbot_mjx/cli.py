@@ -14,6 +14,7 @@ import contextlib
 import difflib
 import functools
 import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Collection, Sequence
@@ -356,6 +357,19 @@ def goals(text: str) -> list[int]:
         return parse_goals(text)
     except UserError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def size(text: str) -> tuple[int, int]:
+    """Parse an argument that is the width and height of a video."""
+    found = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
+    if not found:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size: write it as in 1280x720")
+    sides = (int(found[1]), int(found[2]))
+    try:
+        errors.check_size(sides)
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return sides
 
 
 def origin(text: str) -> str:

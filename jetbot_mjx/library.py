@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Unpack, overload
 from jetbot_mjx import deployment, evaluation, runs, training, tuning, viewers
 from jetbot_mjx.config import Config, Overrides, load_config
 from jetbot_mjx.devices import require_device
-from jetbot_mjx.errors import InvalidError, UserError, check_count, ran_out
+from jetbot_mjx.errors import InvalidError, UserError, check_count, check_size, ran_out
 from jetbot_mjx.runs import default_run_dir, find_run, find_run_config, seed_folders, trusting
 from jetbot_mjx.terminal import restart_clock, show_progress
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 _FITTING = {
     "strip": ("many",),
-    "gallery": ("episodes",),
-    "many": ("which",),
-    "goals": ("which",),
-    "episodes": ("which",),
+    "gallery": ("episodes", "size"),
+    "many": ("which", "size"),
+    "goals": ("which", "size"),
+    "episodes": ("which", "size"),
 }
 """The arguments of `render` that say what to render, with those that may be given beside them."""
 
@@ -169,6 +169,7 @@ def render(
     many: int | None = None,
     gallery: bool = False,
     strip: bool = False,
+    size: tuple[int, int] | None = None,
     trust: bool = False,
     verbose: bool = False,
 ) -> "viewers.Rendered":
@@ -177,13 +178,13 @@ def render(
     Args:
       run: a run or checkpoint, named as for `evaluate`.
       which: the checkpoint of a run: `"best"`, `"last"` or a number of steps.
-      episodes: the number of goals, from the first on (default: 20, of a gallery 4); in an
+      episodes: the number of goals, from the first on (default: 8, of a gallery 4); in an
         `environment` that of episodes (default: 3).
       goals: these of the fixed goals, such as `[3, 17]`, in place of `episodes`.
       many: that many robots in one scene, each with its own goal.
       gallery: whether to render the first, the middle and the last checkpoint side by side.
-      strip: whether to render an image of an untrained, an early and a trained policy; `many` is
-        then the number of robots of each.
+      strip: whether to draw an untrained, an early and a trained policy, `many` robots of each.
+      size: width and height of the video [pixels] (default: 1280, 720; of a gallery 1280, 480).
       trust: whether to run the code that the run names, whoever wrote it.
       verbose: whether to show the progress.
 
@@ -201,21 +202,24 @@ def render(
         "goals": goals is not None,
         "episodes": episodes is not None,
         "which": which != "best",
+        "size": size is not None,
     }
     chosen = next((name for name in _FITTING if given[name]), "episodes")
     for name in given:
         if given[name] and name not in (chosen, *_FITTING[chosen]):
             raise InvalidError(f"render: {chosen} and {name} exclude each other")
+    if size is not None:
+        check_size(size)
     with _ready(verbose, trust):
+        path = find_run(run)
         if strip:
-            return viewers.render_training_strip(find_run(run), robots=16 if many is None else many)
+            return viewers.render_training_strip(path, robots=16 if many is None else many)
         if gallery:
-            return viewers.render_gallery(
-                find_run(run), episodes=4 if episodes is None else episodes
-            )
+            episodes = 4 if episodes is None else episodes
+            return viewers.render_gallery(path, episodes=episodes, size=size)
         if many is not None:
-            return viewers.render_many(find_run(run), robots=many, which=which)
-        return viewers.render_run(find_run(run), episodes=episodes, goals=goals, which=which)
+            return viewers.render_many(path, robots=many, which=which, size=size)
+        return viewers.render_run(path, episodes=episodes, goals=goals, which=which, size=size)
 
 
 def tune(

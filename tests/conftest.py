@@ -210,7 +210,9 @@ def small_videos(monkeypatch):
     """Videos have few frames, and small ones, where nobody looks at them."""
     from jetbot_mjx.viewers import gallery, video
 
-    small = functools.partial(video.VideoRenderer, side=64, fps=2)
+    def small(env, size):
+        return video.VideoRenderer(env, (128, 64), fps=2)
+
     monkeypatch.setattr(gallery, "VideoRenderer", small)
 
 

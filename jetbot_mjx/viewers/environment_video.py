@@ -21,15 +21,17 @@ from jetbot_mjx.viewers.video import (
     FPS,
     GIF_STRIDE,
     HOLD_SECONDS,
+    MISSED,
+    REACHED,
+    SIZE,
     Frame,
     with_lines,
     write_gif,
     write_mp4,
 )
 
-_HEIGHT, _ASPECT = 480, 4 / 3  # [pixels] height, and width over height
 _DISTANCE = 1.5  # of a camera that follows, in the model's extents
-_TEXT, _MARGIN = 20 / 480, 12 / 480  # of the height
+_TEXT, _MARGIN = 0.04, 0.03  # of the height
 
 
 class Motion(NamedTuple):
@@ -83,12 +85,12 @@ class EnvironmentRenderer(contextlib.ExitStack):
     The view is that of the model's first camera, or of one that follows the first body.
     """
 
-    def __init__(self, env: AdaptedEnv, height: int = _HEIGHT, fps: float = FPS) -> None:
+    def __init__(self, env: AdaptedEnv, size: tuple[int, int] = SIZE, fps: float = FPS) -> None:
         """Open the renderer.
 
         Args:
           env: the environment of the motions.
-          height: the height of a frame [pixels].
+          size: the width and height of a frame [pixels].
           fps: frames per second.
 
         Raises:
@@ -98,8 +100,8 @@ class EnvironmentRenderer(contextlib.ExitStack):
         model = require_model(env)
         self._dt = env.dt or float(model.opt.timestep)
         self._camera = view_of(model)
-        self._height, self._fps = height, fps
-        width = round(_ASPECT * height)
+        (width, height), self._fps = size, fps
+        self._height = height
         self._view = self.enter_context(Renderer(model, width=width, height=height))
 
     def frame_count(self, motion: Motion) -> int:
@@ -117,20 +119,20 @@ class EnvironmentRenderer(contextlib.ExitStack):
         margin = round(_MARGIN * self._height)
         for frame in range(self.frame_count(motion)):
             step = min(round(frame / self._fps / self._dt), last)
-            lines = [(f"start {motion.number}  {step * self._dt:.2f} s", "black")]
+            lines = [(f"start {motion.number}   {step * self._dt:.2f} s", "white")]
             if step == last:
-                lines.append((f"return {motion.episode_return:.1f}", "black"))
+                lines.append((f"return {motion.episode_return:.1f}", "white"))
             if step == last and motion.success is not None:
-                told = ("success", "darkgreen") if motion.success else ("no success", "firebrick")
+                told = ("success", REACHED) if motion.success else ("no success", MISSED)
                 lines.append(told)
             image = self._view.frame(motion.qpos[step], {}, self._camera)
-            yield with_lines(image, lines, _TEXT * self._height, (margin, margin))
+            yield with_lines(image, lines, _TEXT * self._height, margin)
 
 
 class EnvironmentVideo:
     """An `EnvironmentVideo` renders policies of a training from the report's first start."""
 
-    _HEIGHT, _FPS = 240, FPS / GIF_STRIDE  # small, so that training waits only briefly
+    _SIZE, _FPS = (320, 240), FPS / GIF_STRIDE  # small, so that training waits only briefly
 
     def __init__(self, setup: Setup) -> None:
         """Prepare the program, which compiles at its first use.
@@ -158,7 +160,7 @@ class EnvironmentVideo:
           UserError: this machine has no OpenGL that works without a display.
         """
         (motion,) = split_motions(self._env, self._evaluator.run(params, report_keys(1)))
-        with EnvironmentRenderer(self._env, self._HEIGHT, self._FPS) as renderer:
+        with EnvironmentRenderer(self._env, self._SIZE, self._FPS) as renderer:
             frames = list(renderer.render_episode(motion))
         write_mp4(path, frames, self._FPS)
         write_gif(path.with_suffix(".gif"), frames)

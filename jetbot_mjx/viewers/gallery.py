@@ -19,22 +19,26 @@ from jetbot_mjx.viewers.environment_video import (
     split_motions,
 )
 from jetbot_mjx.viewers.video import (
+    FADE_FRAMES,
     GIF_STRIDE,
+    SIZE,
     Frame,
     VideoRenderer,
+    join,
     resize_frame,
     split_trajectories,
     write_gif,
     write_mp4,
 )
 
-VIDEO_EPISODES, GALLERY_EPISODES = 20, 4
+VIDEO_EPISODES, GALLERY_EPISODES = 8, 4
 """Default number of goals of the videos of one policy, and of a gallery."""
 
 _ENVIRONMENT_EPISODES = 3  # default in an environment of one's own, whose episodes are longer
 
-_GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
-_GIF_SIZE, _GALLERY_GIF_SIZE = 0.6, 0.75  # relative to the video
+_GALLERY_SIZE = (1280, 480)  # [pixels] of the default video
+_GIF_EPISODES = 8  # what a README or a chat still shows
+_GIF_WIDTH = 640  # [pixels]
 
 
 class Rendered(NamedTuple):
@@ -77,6 +81,7 @@ def render_run(
     episodes: int | None = None,
     goals: Sequence[int] | None = None,
     which: runs.Which = "best",
+    size: tuple[int, int] | None = None,
 ) -> Rendered:
     """Render deterministic episodes of one policy on some of the report's fixed goals.
 
@@ -88,6 +93,7 @@ def render_run(
         environment of one's own.
       goals: Indices of the goals in the order of the video, which replace `episodes`, or None.
       which: The checkpoint of a run folder.
+      size: The width and height of the video, even numbers of pixels; None: `SIZE`.
 
     Returns:
       The files, in `videos/<env_steps>/` of the run folder. With `goals`, their names contain the
@@ -104,7 +110,7 @@ def render_run(
         evaluation.check_goals(goals)
     checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
     if checkpoint.config.environment is not None:
-        return _render_environment(checkpoint, episodes or _ENVIRONMENT_EPISODES, goals)
+        return _render_environment(checkpoint, episodes or _ENVIRONMENT_EPISODES, goals, size)
     if goals is None:
         episodes = episodes or VIDEO_EPISODES
         goals = range(episodes)
@@ -123,17 +129,19 @@ def render_run(
     # Plot the trajectories and render the videos.
     with runs.writing_to(files["plot"]):
         _trajectory_plot(checkpoint, env, rolled_out, goals).save(files["plot"])
-    with VideoRenderer(env) as renderer:
+    with VideoRenderer(env, size or SIZE) as renderer:
         drives = split_trajectories(env, rolled_out, goals)
         total = sum(renderer.frame_count([drive]) for drive in drives)
-        videos = [renderer.render_episode(drive) for drive in drives]
-        _write_videos(files, videos, total, _GIF_SIZE)
+        _write_videos(files, [renderer.render_episode(drive) for drive in drives], total)
     successes = {checkpoint.env_steps: int(rolled_out.success.sum())}
     return Rendered(successes, len(goals), files)
 
 
 def _render_environment(
-    checkpoint: runs.Checkpoint, episodes: int, goals: Sequence[int] | None
+    checkpoint: runs.Checkpoint,
+    episodes: int,
+    goals: Sequence[int] | None,
+    size: tuple[int, int] | None,
 ) -> Rendered:
     """Render a policy from the report's first starts, in an environment of one's own.
 
@@ -155,9 +163,9 @@ def _render_environment(
     motions = split_motions(env, found)
     name = evaluation.name_with_count("episodes", episodes, _ENVIRONMENT_EPISODES)
     files = video_files(checkpoint.results_dir / "videos" / checkpoint.path.name, name)
-    with EnvironmentRenderer(env) as renderer:
+    with EnvironmentRenderer(env, size or SIZE) as renderer:
         total = sum(renderer.frame_count(one) for one in motions)
-        _write_videos(files, [renderer.render_episode(one) for one in motions], total, _GIF_SIZE)
+        _write_videos(files, [renderer.render_episode(one) for one in motions], total)
     note = (
         f"{checkpoint.env_steps:>12,} steps  return {summary.episode_return:.1f} in the mean of"
         f" {episodes:,} episode{'s' if episodes > 1 else ''}"
@@ -165,7 +173,12 @@ def _render_environment(
     return Rendered({}, episodes, files, note)
 
 
-def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> Rendered:
+def render_gallery(
+    run_dir: str | Path,
+    *,
+    episodes: int = GALLERY_EPISODES,
+    size: tuple[int, int] | None = None,
+) -> Rendered:
     """Render the first, the middle and the last checkpoint of a run driving to the same goals.
 
     The goals are the report's, from the first on, so that none is chosen by its outcome.
@@ -173,6 +186,7 @@ def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> 
     Args:
       run_dir: A run folder.
       episodes: The number of goals.
+      size: The width and height of the video, even numbers of pixels; None: `_GALLERY_SIZE`.
 
     Returns:
       The files, in `videos/` of the run folder. Their names contain the number of goals if it is
@@ -201,13 +215,15 @@ def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> 
     # Render the videos side by side, one goal after the other.
     headings = [f"{step:,} steps" for step in chosen]
     by_goal = list(zip(*(split_trajectories(env, each, goals) for each in rolled_out), strict=True))
-    with VideoRenderer(env) as renderer:
+    width, height = size or _GALLERY_SIZE
+    # Views of equal width, and together an even number of pixels, as videos need it.
+    with VideoRenderer(env, (2 * (width // (2 * len(chosen))), height)) as renderer:
         videos = [
             renderer.render_side_by_side(list(zip(headings, same_goal, strict=True)))
             for same_goal in by_goal
         ]
         total = sum(renderer.frame_count(same_goal) for same_goal in by_goal)
-        _write_videos(files, videos, total, _GALLERY_GIF_SIZE)
+        _write_videos(files, videos, total)
     successes = {
         step: int(each.success.sum()) for step, each in zip(chosen, rolled_out, strict=True)
     }
@@ -276,28 +292,42 @@ def _trajectory_plot(
         return Image.open(io.BytesIO(evaluation.to_png(figure))).convert("RGB")
 
 
-def _write_videos(
-    files: Mapping[str, Path], videos: Sequence[Iterable[Frame]], total: int, size: float
-) -> None:
-    """Write all videos to one mp4 file, and the first ones to a gif of relative size `size`.
+def _write_videos(files: Mapping[str, Path], videos: Sequence[Iterable[Frame]], total: int) -> None:
+    """Write all videos to one mp4 file, and the first ones to a gif.
 
     Args:
       files: The result of `video_files`.
       videos: The frames of each video.
       total: The number of frames of all videos.
-      size: The size of the gif relative to the video.
     """
-    gif_frames: list[Frame] = []
-
-    def frames(advance: Advance) -> Iterator[Frame]:
-        for place, video in enumerate(videos):
-            for index, frame in enumerate(video):
-                if place < _GIF_EPISODES and index % GIF_STRIDE == 0:
-                    gif_frames.append(resize_frame(frame, size))
-                yield frame
-                advance(1)
-
-    with stage("frames", total) as advance, runs.writing_to(files["video"]):
-        write_mp4(files["video"], frames(advance))
+    frames = write_video(files["video"], videos, total, _GIF_WIDTH)
     with stage("writing the gif"), runs.writing_to(files["gif"]):
-        write_gif(files["gif"], gif_frames)
+        write_gif(files["gif"], frames)
+
+
+def write_video(
+    path: Path, videos: Sequence[Iterable[Frame]], total: int, gif_width: int
+) -> list[Frame]:
+    """Write videos one after the other to an mp4 file, and return the frames of its gif.
+
+    Args:
+      path: The path of the file.
+      videos: The frames of each video.
+      total: The number of frames of all videos.
+      gif_width: The largest width of the gif [pixels].
+
+    Returns:
+      Frames of the first `_GIF_EPISODES` videos.
+    """
+    shown: list[list[Frame]] = [[] for _ in videos]
+
+    def watched(video: Iterable[Frame], small: list[Frame], advance: Advance) -> Iterator[Frame]:
+        for index, frame in enumerate(video):
+            if index % GIF_STRIDE == 0:
+                small.append(resize_frame(frame, min(1.0, gif_width / frame.shape[1])))
+            yield frame
+            advance(1)
+
+    with stage("frames", total) as advance, runs.writing_to(path):
+        write_mp4(path, join(watched(*one, advance) for one in zip(videos, shown, strict=True)))
+    return list(join(shown[:_GIF_EPISODES], FADE_FRAMES // GIF_STRIDE))

@@ -12,10 +12,25 @@ from PIL import Image, ImageDraw, ImageFont
 
 from jetbot_mjx import runs
 from jetbot_mjx.errors import UserError, check_count
-from jetbot_mjx.viewers.gallery import Rendered, run_episodes, run_folder, video_files
+from jetbot_mjx.terminal import stage
+from jetbot_mjx.viewers.gallery import (
+    Rendered,
+    run_episodes,
+    run_folder,
+    video_files,
+    write_video,
+)
 from jetbot_mjx.viewers.grid_renderer import GridRenderer, camera_above, pull_back_camera
 from jetbot_mjx.viewers.robot_grid import RobotGrid, place_on_grid
-from jetbot_mjx.viewers.video import FPS, GIF_STRIDE, Frame, resize_frame, write_gif, write_mp4
+from jetbot_mjx.viewers.video import (
+    FPS,
+    REACHED,
+    SIZE,
+    Frame,
+    resize_frame,
+    with_lines,
+    write_gif,
+)
 
 MOST_ROBOTS = 1024
 """Largest number of robots in one scene."""
@@ -23,14 +38,14 @@ MOST_ROBOTS = 1024
 MAX_GIF_BYTES = 3_000_000
 """Largest size of a GIF, which a README still shows quickly."""
 
-_SIZE = (960, 540)  # [pixels] width and height of the video
-_GIF_SCALES = (0.75, 0.6, 0.55, 0.5, 0.4, 0.33, 0.25)  # relative to the video, tried in this order
+_GIF_WIDTHS = (720, 640, 576, 528, 480, 384, 320, 240)  # [pixels] tried in this order
 _PULL_BACK_SECONDS = 6.0  # duration of the camera's move
-_TEXT = 22  # [pixels] height of the font
+_TEXT = 0.04  # height of the font, relative to the video's
 _HOLD_SECONDS = 1.0  # pause after the end
 
 # The strip of three policies.
 _STRIP_SIDE = 480  # [pixels]
+_HEADING = 22  # [pixels] height of the font
 _STRIP_SPACING = (1.8, 1.8)  # [m] the same for all policies
 _STRIP_ROBOT, _STRIP_MARKER, _STRIP_TRAIL = 18.0, 13.0, 2.0  # [pixels]
 _EARLY_SUCCESS = 0.4  # the early policy is the one closest to this success rate
@@ -38,7 +53,11 @@ _CLOSE = 0.15  # difference of success rates up to which the closest policy is c
 
 
 def render_many(
-    run_or_checkpoint: str | Path, *, robots: int = 1024, which: runs.Which = "best"
+    run_or_checkpoint: str | Path,
+    *,
+    robots: int = 1024,
+    which: runs.Which = "best",
+    size: tuple[int, int] | None = None,
 ) -> Rendered:
     """Render many robots with one policy that drive to the report's first goals in one scene.
 
@@ -49,6 +68,7 @@ def render_many(
       run_or_checkpoint: A run folder, or one of its checkpoint folders.
       robots: The number of robots, at most `MOST_ROBOTS`.
       which: The checkpoint of a run folder.
+      size: The width and height of the video, even numbers of pixels; None: `SIZE`.
 
     Returns:
       The files, in `videos/<env_steps>/` of the run folder. The GIF has at most `MAX_GIF_BYTES`.
@@ -65,13 +85,14 @@ def render_many(
     folder = checkpoint.results_dir / "videos" / checkpoint.path.name
     files = video_files(folder, f"many-{robots}")
     # Render the frames, and write the animation in the largest size that fits.
-    with GridRenderer(env, robots, *_SIZE) as renderer:
-        frames = list(_video_frames(grid, renderer))
-    with runs.writing_to(files["video"]):
-        write_mp4(files["video"], frames)
-    with runs.writing_to(files["gif"]):
-        for scale in _GIF_SCALES:
-            write_gif(files["gif"], [resize_frame(frame, scale) for frame in frames[::GIF_STRIDE]])
+    width, height = size or SIZE
+    with GridRenderer(env, robots, width, height) as renderer:
+        video = _video_frames(grid, renderer, width / height)
+        frames = write_video(files["video"], [video], _frame_count(grid), _GIF_WIDTHS[0])
+    with stage("writing the gif"), runs.writing_to(files["gif"]):
+        for gif_width in _GIF_WIDTHS:
+            scale = min(1.0, gif_width / frames[0].shape[1])
+            write_gif(files["gif"], [resize_frame(frame, scale) for frame in frames])
             if files["gif"].stat().st_size <= MAX_GIF_BYTES:
                 break
     return Rendered({checkpoint.env_steps: int(grid.reached.sum())}, robots, files)
@@ -134,36 +155,32 @@ def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
     return Rendered(successes, robots, {"image": png}, note_on_early(rates[chosen["early"]]))
 
 
-def _video_frames(grid: RobotGrid, renderer: GridRenderer) -> Iterator[Frame]:
-    """Render the video's frames, labelled with the numbers of robots and of goals reached."""
-    seconds = max(grid.seconds, _PULL_BACK_SECONDS) + _HOLD_SECONDS
-    aspect = _SIZE[0] / _SIZE[1]
-    for number in range(math.ceil(seconds * FPS)):
+def _frame_count(grid: RobotGrid) -> int:
+    """Return the number of the video's frames."""
+    return math.ceil((max(grid.seconds, _PULL_BACK_SECONDS) + _HOLD_SECONDS) * FPS)
+
+
+def _video_frames(grid: RobotGrid, renderer: GridRenderer, aspect: float) -> Iterator[Frame]:
+    """Render the video's frames, labelled with the time and the number of goals reached."""
+    for number in range(_frame_count(grid)):
         now = number / FPS
         camera = pull_back_camera(grid, renderer.fovy, aspect, now / _PULL_BACK_SECONDS)
         reached = int(grid.reached_at(grid.steps_at(now)).sum())
-        lines = (f"{len(grid.steps):,} robots", f"{reached:,} at their goals")
-        yield _with_label(renderer.frame(grid, now, camera), lines)
-
-
-def _with_label(frame: Frame, lines: Sequence[str]) -> Frame:
-    """Write lines of white text on a dark ground into the upper left corner of a frame."""
-    image = Image.fromarray(frame)
-    draw = ImageDraw.Draw(image, "RGBA")
-    font: object = ImageFont.load_default(_TEXT)
-    text, margin = "\n".join(lines), _TEXT / 2
-    right, lower = draw.multiline_textbbox((margin, margin), text, font, spacing=_TEXT / 4)[2:]
-    draw.rectangle((0, 0, right + margin, lower + margin), (10, 14, 20, 190))
-    draw.multiline_text((margin, margin), text, "white", font, spacing=_TEXT / 4)
-    return np.asarray(image)
+        lines = [
+            (f"{len(grid.steps):,} robots   {min(now, grid.seconds):4.1f} s", "white"),
+            (f"{reached:,} at their goals", REACHED),
+        ]
+        frame = renderer.frame(grid, now, camera)
+        size = _TEXT * len(frame)
+        yield with_lines(frame, lines, size, round(size / 2))
 
 
 def _below_heading(frame: Frame, lines: Sequence[str]) -> Frame:
     """Add a white border to a frame, which is wider above it and holds lines of text."""
-    border, height = 4, round(1.5 * _TEXT) * len(lines)
+    border, height = 4, round(1.5 * _HEADING) * len(lines)
     widths = ((height, border), (border, border), (0, 0))
     image = Image.fromarray(np.pad(frame, widths, constant_values=255))
-    font: object = ImageFont.load_default(_TEXT)
+    font: object = ImageFont.load_default(_HEADING)
     ImageDraw.Draw(image).multiline_text((border, 2), "\n".join(lines), "black", font)
     return np.asarray(image)
 

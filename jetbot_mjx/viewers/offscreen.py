@@ -4,7 +4,7 @@ import contextlib
 import copy
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -20,11 +20,28 @@ _OVERSAMPLING = 2
 samples per pixel, and on a CPU it takes two thirds of the time (one third for small images)."""
 
 _SHADOW_SIZE = 4096
-"""Side of the shadow map [pixels]; on the floor one of them is 3 mm wide."""
+"""Side of the shadow map [pixels]."""
+
+_SHADOW_REACH = 6.0
+"""Half the side of the floor that the shadow map covers [m]; one of its pixels is 3 mm wide."""
+
+_SHADOW_MIDDLE = (2.5, -2.5)
+"""Middle of that floor [m]: beyond its corner at +x and -y, which views from behind the start see,
+the floor would shade itself."""
 
 _REACHED = np.array((0.20, 0.85, 0.30, 1.0), np.float32)
 _TRAIL = np.array((0.10, 0.35, 0.85, 1.0), np.float32)
-_TRAIL_WIDTH = 0.01  # fraction of the image's width
+_TRAIL_WIDTH = 0.009  # fraction of the image's height
+_LABEL = np.array((0.20, 0.22, 0.26, 1.0), np.float32)
+_LABEL_WIDTH = 0.004  # fraction of the image's height
+
+_CELLS = 4  # of the grid, per metre
+_FLOOR, _THIN, _THICK = (222, 225, 229), (196, 202, 209), (146, 155, 166)  # colours of the grid
+_STROKES = {
+    "1": [[(0, 0.75), (0.3, 1), (0.3, 0)]],
+    "2": [[(0, 0.8), (0.2, 1), (0.4, 1), (0.6, 0.8), (0.6, 0.6), (0, 0), (0.6, 0)]],
+    "m": [[(0, 0), (0, 0.65), (0.8, 0.65), (0.8, 0)], [(0.4, 0.65), (0.4, 0)]],
+}  # how the labels of the grid are drawn
 
 _NEAR = 0.005  # [m] near clipping plane: the onboard camera comes close to the goal
 _ELEVATION = -50.0  # [degrees] elevation of the overview camera
@@ -58,6 +75,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         shadows: bool = True,
         reached: bool = False,
         trail_w: Float[np.ndarray, "n 3"] | None = None,
+        lines_w: Sequence[Float[np.ndarray, "n 3"]] = (),
     ) -> UInt8[np.ndarray, "height width 3"]:
         """Render one pose.
 
@@ -68,6 +86,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
           shadows: whether to render shadows; without them, rendering takes less than half the time.
           reached: whether the goal is green because the robot has reached it.
           trail_w: points [m], world frame, to connect by a line, such as the path so far.
+          lines_w: thin grey lines to draw in the same way, such as `METRE_LABELS`.
 
         Returns:
           The image, RGB.
@@ -80,8 +99,11 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         if reached:
             paint_reached(self._renderer.scene, self._goal_geoms)
+        height = self._renderer.height
+        for line_w in lines_w:
+            add_lines(self._renderer.scene, line_w, _LABEL_WIDTH * height, _LABEL)
         if trail_w is not None:
-            width = _TRAIL_WIDTH * self._renderer.width
+            width = _TRAIL_WIDTH * height
             add_lines(self._renderer.scene, np.asarray(trail_w, float), width, _TRAIL)
         return reduce_image(self._renderer.render())
 
@@ -125,6 +147,46 @@ def add_lines(
         mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
         mujoco.mjv_connector(geom, kind, width, start, end)
         scene.ngeom += 1
+
+
+def with_metre_grid(mj_model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy of a robot's model with fine shadows and a grid of metres on its floor.
+
+    Args:
+      mj_model: the model, whose material `floor` has a texture that repeats every metre.
+    """
+    model = copy.copy(mj_model)
+    model.vis.map.shadowclip = _SHADOW_REACH / model.stat.extent
+    model.light_pos[:, :2] = _SHADOW_MIDDLE
+    texture = int(model.mat_texid[model.material("floor").id, mujoco.mjtTextureRole.mjTEXROLE_RGB])
+    side, first = model.tex_width[texture], model.tex_adr[texture]
+    # The middle of the texture lies at the origin.
+    away = np.abs(np.arange(side) - side // 2)
+    tile = np.tile(np.array(_FLOOR, np.uint8), (side, side, 1))
+    for lines, color in ((away % (side // _CELLS) < 1, _THIN), (away < 2, _THICK)):
+        tile[lines], tile[:, lines] = color, color
+    model.tex_data[first : first + tile.size] = tile.ravel()
+    return model
+
+
+def _label(text: str, left_w: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "n 3"]]:
+    """Return the strokes of a label that lies on the floor and is read by who looks along x [m]."""
+    strokes, size = [], 0.06
+    for place, letter in enumerate(text):
+        for stroke in _STROKES.get(letter, []):
+            right, up = size * np.array(stroke).T
+            x, y = left_w[0] + up + 0.3 * size, left_w[1] - right - 0.55 * size * place
+            strokes.append(np.stack([x, y, 0 * x + 0.002], axis=1))
+    return strokes
+
+
+METRE_LABELS = tuple(
+    stroke
+    for metres in (1, 2)
+    for x, y in ((metres, 0), (-metres, 0), (0, metres), (0, -metres))
+    for stroke in _label(f"{metres} m", np.array([x, y - 0.03]))
+)
+"""Lines that write on the floor how far it is from the start, along both axes [m]."""
 
 
 def open_renderer(

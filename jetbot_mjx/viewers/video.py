@@ -1,14 +1,15 @@
 """Render episodes to video frames, and write videos and animations.
 
-Videos play in real time. Every frame shows the number of the report's fixed goal, the time, the
-remaining distance, and the outcome at the end; a goal turns green when its robot reaches it.
+Videos play in real time, and their end fades into their start. Every frame shows the number of the
+report's fixed goal, the time, the remaining distance, and the outcome at the end; a goal turns
+green when its robot reaches it. The floor has a line every quarter of a metre.
 """
 
 import contextlib
 import functools
 import io
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,11 +24,12 @@ from jetbot_mjx.agents import PolicyParams
 from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ, JetBotEnv
 from jetbot_mjx.evaluation import Episodes, Evaluator, report_keys
 from jetbot_mjx.runs import Setup, write_bytes
+from jetbot_mjx.viewers import offscreen
 from jetbot_mjx.viewers.offscreen import Renderer, overview
 from jetbot_mjx.viewers.policy_view import resize_nearest
 
-VIEW = 400
-"""Side of one view [pixels]."""
+SIZE = (1280, 720)
+"""Width and height of a video [pixels]."""
 
 FPS = 25
 """Frames per second of a video."""
@@ -38,15 +40,22 @@ GIF_STRIDE = 2
 HOLD_SECONDS = 0.6
 """Pause after the end, so that the viewer sees it [s]."""
 
-# Lengths as fractions of the view's side.
+FADE_FRAMES = 8
+"""Frames from the end of one episode to the start of the next."""
+
+# Lengths as fractions of a view's shorter side.
 _INSET = (0.30, 0.225)  # width and height of the onboard camera's image
-_SEEN, _SEEN_OF_MANY = 0.32, 0.24  # longer side of what a policy sees, alone and side by side
+_SEEN = 0.25  # longer side of what a policy sees
 _MARGIN = 0.03  # between the border and text or inset
-_TEXT = 0.05  # height of the font
+_TEXT = 0.04  # height of the font
+_SMALLEST_TEXT = 11  # [pixels] still readable
 _TRAIL_STEPS = 4  # environment steps per segment of the trail
 # Fraction of a view, from its middle, that the trajectory may fill; text and inset are above.
 _FILLED = {"sides": 0.92, "above": 0.42, "below": 0.92}
 _AROUND = 0.12  # [m] around a position, so that the robot and cubes are inside the frame
+
+REACHED, MISSED = "#7be08a", "#ff9a6b"
+"""Colours of an outcome on a dark ground."""
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
@@ -117,21 +126,30 @@ def split_trajectories(
 class VideoRenderer(contextlib.ExitStack):
     """A `VideoRenderer` renders trajectories; it is a context manager that frees its cameras."""
 
-    def __init__(self, env: JetBotEnv, side: int = VIEW, fps: float = FPS) -> None:
+    def __init__(
+        self,
+        env: JetBotEnv,
+        size: tuple[int, int] = SIZE,
+        fps: float = FPS,
+        *,
+        shadows: bool = True,
+    ) -> None:
         """Open the renderers.
 
         Args:
           env: the environment of the trajectories.
-          side: the side of one square view [pixels].
+          size: the width and height of one view [pixels].
           fps: frames per second.
+          shadows: whether to render shadows, which takes twice as long.
 
         Raises:
           UserError: this machine has no OpenGL that works without a display.
         """
         super().__init__()
         self._fovy = float(env.mj_model.vis.global_.fovy)
-        self._side, self._fps = side, fps
-        width, height = (round(share * side) for share in _INSET)
+        self._size, self._fps, self._shadows = size, fps, shadows
+        self._side = min(size)
+        width, height = (round(share * self._side) for share in _INSET)
         self._policy_image = None
         if (camera := env.camera) is not None:
             self._policy_image = jax.jit(
@@ -139,27 +157,27 @@ class VideoRenderer(contextlib.ExitStack):
                     camera.pose(qpos[QPOS_XYZ], qpos[QPOS_QUAT]), markers
                 )
             )
-        self._view = self.enter_context(Renderer(env.mj_model, width=side, height=side))
-        self._inset = self.enter_context(Renderer(env.mj_model, width=width, height=height))
+        model = offscreen.with_metre_grid(env.mj_model)
+        self._view = self.enter_context(Renderer(model, width=size[0], height=size[1]))
+        self._inset = self.enter_context(Renderer(model, width=width, height=height))
 
     def render_episode(self, trajectory: Trajectory) -> Iterator[Frame]:
-        """Render one episode: chase camera with the onboard camera as inset, and the top view.
-
-        If the policy sees, the inset is its image.
+        """Render one episode, as `render_side_by_side` does.
 
         Args:
           trajectory: the episode.
 
         Returns:
-          Frames, two views wide.
+          Frames, one view wide.
         """
-        return self._frames([trajectory], [functools.partial(self._episode_frame, trajectory)])
+        return self.render_side_by_side([("", trajectory)])
 
     def render_side_by_side(self, episodes: Sequence[tuple[str, Trajectory]]) -> Iterator[Frame]:
         """Render several episodes side by side in the same time; finished robots stand still.
 
         All views have the same fixed camera behind the start, which sees all paths and goals
-        without overlap with text or inset.
+        without overlap with text or inset. The inset is the image of the onboard camera, or what
+        the policy sees.
 
         Args:
           episodes: a heading and a trajectory for each view, from left to right.
@@ -168,140 +186,105 @@ class VideoRenderer(contextlib.ExitStack):
           Frames, one view wide per episode.
         """
         trajectories = [trajectory for _, trajectory in episodes]
-        camera = overview(np.vstack([*map(_extent, trajectories)]), self._fovy, **_FILLED)
-        draws = [functools.partial(self._episode_view, *one, camera=camera) for one in episodes]
-        return self._frames(trajectories, draws)
-
-    def _frames(
-        self, trajectories: Sequence[Trajectory], draws: Sequence[Callable[[int], Frame]]
-    ) -> Iterator[Frame]:
-        """Render trajectories side by side, up to a pause after the longest.
-
-        Args:
-          trajectories: the episodes, from left to right.
-          draws: for each of them a function that renders the index of a state.
-        """
+        camera = self._overview(trajectories)
         # A view is rendered again only if its robot has made a step.
-        draws = [functools.lru_cache(1)(draw) for draw in draws]
+        draws = [
+            functools.lru_cache(1)(functools.partial(self._episode_view, *one, camera))
+            for one in episodes
+        ]
         for frame in range(self.frame_count(trajectories)):
             steps = [trajectory.step_at(frame / self._fps) for trajectory in trajectories]
-            yield np.hstack([draw(step) for draw, step in zip(draws, steps, strict=True)])
+            views = [draw(step) for draw, step in zip(draws, steps, strict=True)]
+            # A white line between neighbouring views.
+            yield np.hstack([*map(_with_white_border, views[:-1]), views[-1]])
 
-    def _episode_frame(self, trajectory: Trajectory, step: int) -> Frame:
-        chase = self._view_frame(trajectory, step, "chase", trail=False)
-        top = self._view_frame(trajectory, step, "top")
-        inset = self._inset_image(trajectory, step, _SEEN)
-        # In the lower corner the inset hides a goal only while the robot drives away from it.
-        sees = self._policy_image is not None
-        chase = self._with_inset(chase, inset, top=sees, left=sees)
-        beside = round(_MARGIN * self._side) + inset.shape[1] if sees else 0
-        return np.hstack([self._with_text(chase, trajectory, step, beside=beside), top])
+    def _overview(self, trajectories: Sequence[Trajectory]) -> mujoco.MjvCamera:
+        """Return the camera that sees all episodes below text and inset."""
+        width, height = self._size
+        filled = _FILLED | {"sides": _FILLED["sides"] * width / height}
+        return overview(np.vstack([*map(_extent, trajectories)]), self._fovy, **filled)
 
     def frame_count(self, trajectories: Sequence[Trajectory]) -> int:
         """Return the number of frames of a video of one trajectory, or of several side by side."""
         longest = max(trajectory.steps * trajectory.dt for trajectory in trajectories)
         return math.ceil(longest * self._fps) + round(HOLD_SECONDS * self._fps) + 1
 
-    def _view_frame(
-        self,
-        trajectory: Trajectory,
-        step: int,
-        camera: str | mujoco.MjvCamera,
-        *,
-        trail: bool = True,
+    def _episode_view(
+        self, heading: str, trajectory: Trajectory, camera: mujoco.MjvCamera, step: int
     ) -> Frame:
-        """Render one state with a trail, or else with shadows."""
-        return self._view.frame(
+        """Render one state with everything that belongs to it."""
+        view = self._view.frame(
             trajectory.qpos[step],
             trajectory.markers,
             camera,
-            shadows=not trail,
+            shadows=self._shadows,
             reached=trajectory.reached_at(step),
-            trail_w=trajectory.trail_w(step) if trail else None,
+            trail_w=trajectory.trail_w(step),
+            lines_w=offscreen.METRE_LABELS,
         )
+        inset = self._inset_image(trajectory, step)
+        return self._with_text(self._with_inset(view, inset), trajectory, step, heading)
 
-    def _episode_view(
-        self, heading: str, trajectory: Trajectory, step: int, camera: mujoco.MjvCamera
-    ) -> Frame:
-        view = self._view_frame(trajectory, step, camera)
-        # A white line between neighbouring views.
-        view = np.pad(view[:, :-1], ((0, 0), (0, 1), (0, 0)), constant_values=255)
-        inset = self._inset_image(trajectory, step, _SEEN_OF_MANY)
-        view = self._with_inset(view, inset, top=True, left=False)
-        return self._with_text(view, trajectory, step, heading)
-
-    def _inset_image(self, trajectory: Trajectory, step: int, share: float) -> Frame:
-        """Return what the policy sees, or the onboard camera's image, with a white border.
-
-        Args:
-          trajectory: the episode.
-          step: the index of the state.
-          share: the longer side of what the policy sees, as a fraction of the view's side.
-        """
+    def _inset_image(self, trajectory: Trajectory, step: int) -> Frame:
+        """Return what the policy sees, or the onboard camera's image, with a white border."""
         qpos, markers = trajectory.qpos[step], trajectory.markers
         if self._policy_image is None:
             reached = trajectory.reached_at(step)
             image = self._inset.frame(qpos, markers, "onboard", shadows=False, reached=reached)
         else:
             seen = np.asarray(self._policy_image(qpos, markers))
-            image = resize_nearest(seen, round(share * self._side))
+            image = resize_nearest(seen, round(_SEEN * self._side))
         return np.pad(image, ((2, 2), (2, 2), (0, 0)), constant_values=255)
 
-    def _with_inset(self, view: Frame, inset: Frame, *, top: bool, left: bool) -> Frame:
-        """Insert an image in a corner of a view."""
+    def _with_inset(self, view: Frame, inset: Frame) -> Frame:
+        """Insert an image in the upper right corner of a view."""
         height, width = inset.shape[:2]
         margin = round(_MARGIN * self._side)
-        row = margin if top else self._side - margin - height
-        column = margin if left else self._side - margin - width
+        left = self._size[0] - margin - width
         view = view.copy()
-        view[row : row + height, column : column + width] = inset
+        view[margin : margin + height, left : left + width] = inset
         return view
 
-    def _with_text(
-        self,
-        frame: Frame,
-        trajectory: Trajectory,
-        step: int,
-        heading: str = "",
-        beside: int = 0,
-    ) -> Frame:
-        """Write heading, goal number, time, remaining distance and outcome into a view.
-
-        The text begins at the left border of the view, or right of the column `beside`.
-        """
-        lines = [(heading, "black")] if heading else []
+    def _with_text(self, frame: Frame, trajectory: Trajectory, step: int, heading: str) -> Frame:
+        """Write heading, goal number, time, remaining distance and outcome into a view."""
+        lines = [(heading, "white")] if heading else []
         lines += [
-            (f"goal {trajectory.goal_number}  {step * trajectory.dt:4.2f} s", "black"),
-            (f"{trajectory.distance(step):4.2f} m to go", "black"),
+            (f"goal {trajectory.goal_number}   {step * trajectory.dt:4.2f} s", "white"),
+            (f"{trajectory.distance(step):4.2f} m to go", "white"),
         ]
         if step == trajectory.steps:
-            lines.append(
-                ("reached", "darkgreen") if trajectory.reached else ("missed", "firebrick")
-            )
-        margin = round(_MARGIN * self._side)
-        return with_lines(frame, lines, _TEXT * self._side, (beside + margin, margin))
+            lines.append(("reached", REACHED) if trajectory.reached else ("missed", MISSED))
+        return with_lines(frame, lines, _TEXT * self._side, round(_MARGIN * self._side))
+
+
+def _with_white_border(view: Frame) -> Frame:
+    """Return a view whose last column is white."""
+    return np.pad(view[:, :-1], ((0, 0), (0, 1), (0, 0)), constant_values=255)
 
 
 def with_lines(
-    frame: Frame, lines: Sequence[tuple[str, str]], size: float, corner: tuple[float, float]
+    frame: Frame, lines: Sequence[tuple[str, str]], size: float, margin: float = 0
 ) -> Frame:
-    """Write lines of text into a frame.
+    """Write lines of text on a dark ground into the upper left corner of a frame.
 
     Args:
       frame: the frame, which is not modified.
       lines: each line with the name of its colour.
       size: the height of the font [pixels].
-      corner: column and row at which the first line begins.
+      margin: the distance from the frame's borders [pixels].
     """
+    size = max(size, _SMALLEST_TEXT)
     image = Image.fromarray(frame)
-    draw = ImageDraw.Draw(image)
+    panel = Image.new("RGBA", image.size)
+    draw = ImageDraw.Draw(panel)
+    inner, spacing = 0.45 * size, 1.25 * size
+    width = max(draw.textlength(text, _font(size)) for text, _ in lines)
+    corner = (margin + width + 2 * inner, margin + spacing * len(lines) + 1.4 * inner)
+    draw.rounded_rectangle((margin, margin, *corner), inner, (10, 14, 20, 170))
     for row, (text, colour) in enumerate(lines):
-        position = (corner[0], corner[1] + row * 1.15 * size)
-        # The white outline makes text readable on any background, but narrows the spaces.
-        spaced = text.replace(" ", "  ")
-        draw.text(
-            position, spaced, colour, _font(size), stroke_width=size / 10, stroke_fill="white"
-        )
+        place = (margin + inner, margin + 0.5 * inner + row * spacing)
+        draw.text(place, text, colour, _font(size))
+    image.paste(panel, mask=panel)
     return np.asarray(image)
 
 
@@ -326,7 +309,7 @@ class EvaluationVideo:
     GOALS = 4
     """Number of episodes side by side."""
 
-    _SIDE, _FPS = 256, FPS / GIF_STRIDE  # small, so that training waits only briefly
+    _SIZE, _FPS = (256, 256), FPS / GIF_STRIDE  # small, so that training waits only briefly
 
     def __init__(self, setup: Setup) -> None:
         """Prepare the program, which compiles at its first use.
@@ -350,7 +333,7 @@ class EvaluationVideo:
         """
         episodes = self._evaluator.run(params, report_keys(self.GOALS))
         trajectories = split_trajectories(self._env, episodes, range(self.GOALS))
-        with VideoRenderer(self._env, self._SIDE, self._FPS) as renderer:
+        with VideoRenderer(self._env, self._SIZE, self._FPS, shadows=False) as renderer:
             headed = [(f"{env_steps:,} steps", one) for one in trajectories]
             frames = list(renderer.render_side_by_side(headed))
         write_mp4(path, frames, self._FPS)
@@ -365,6 +348,31 @@ def resize_frame(frame: Frame, factor: float) -> Frame:
       factor: the factor on width and height, below 1.
     """
     return np.asarray(ImageOps.scale(Image.fromarray(frame), factor, Image.Resampling.BOX))
+
+
+def join(videos: Iterable[Iterable[Frame]], fade_frames: int = FADE_FRAMES) -> Iterator[Frame]:
+    """Yield the frames of videos one after the other, as a loop: the last fades into the first.
+
+    Args:
+      videos: the frames of each video, all of the same size.
+      fade_frames: the number of frames between two videos.
+    """
+    first = last = None
+    for video in videos:
+        for number, frame in enumerate(video):
+            if number == 0 and last is not None:
+                yield from _fade(last, frame, fade_frames)
+            first = frame if first is None else first
+            yield frame
+            last = frame
+    if first is not None and last is not None:
+        yield from _fade(last, first, fade_frames)
+
+
+def _fade(before: Frame, after: Frame, frames: int) -> Iterator[Frame]:
+    for number in range(frames):
+        share = (number + 1) / (frames + 1)
+        yield np.round((1 - share) * before + share * after).astype(np.uint8)
 
 
 def write_mp4(path: Path, frames: Iterable[Frame], fps: float = FPS) -> None:
