@@ -50,6 +50,7 @@ NUMBERS = {"--seeds": "2", "--episodes": "3", "--checkpoint": "256"}
 TRAININGS = (
     "jetbot --run-dir runs/mine",
     "jetbot --seeds 5 --run-dir runs/five",
+    "hopper --run-dir runs/hopper",
 )
 """The trainings whose runs the other commands name."""
 
@@ -83,7 +84,7 @@ def make_small(text):
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory):
-    """A checkout with small configurations, in which the two runs of the pages are trained."""
+    """A checkout with small configurations, in which the runs of the pages are trained."""
     folder = tmp_path_factory.mktemp("checkout")
     for path in [*(ROOT / "configs").glob("*.yaml"), *(ROOT / "examples").glob("*")]:
         place = folder / path.relative_to(ROOT)
