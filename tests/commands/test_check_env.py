@@ -46,12 +46,13 @@ OWN = "helpers.broken_environments"
 def test_a_sound_environment_is_clean_and_its_costs_are_told(capsys):
     assert check_env.main([f"{OWN}:Sound", "--set", "task.episode_length=8"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line[:16] for line in lines[:3]] == [
+    assert [line[:16] for line in lines[:4]] == [
         "ok     interface",
         "ok     purity   ",
+        "ok     batch    ",
         "ok     drive    ",
     ]
-    assert lines[3:8] == [
+    assert lines[4:9] == [
         f"{OWN}:Sound: no errors",
         "sizes      2 observations, 1 action",
         "metrics    speed",
@@ -64,7 +65,7 @@ def test_a_sound_environment_is_clean_and_its_costs_are_told(capsys):
 def test_an_environment_that_is_no_kernel_is_told_why(capsys):
     assert check_env.main([f"{OWN}:Sorts"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[7].startswith("step is no kernel: one kernel cannot do ")
+    assert lines[8].startswith("step is no kernel: one kernel cannot do ")
     assert "of 16 instances" in lines[-1]
 
 
@@ -74,7 +75,7 @@ def test_a_finding_about_an_environment_gives_exit_code_1(capsys):
     assert lines[0].startswith("wrong  interface  ")
     assert lines[1].endswith("HasNoReset is no environment: it lacks reset")
     assert lines[2:] == [
-        "not checked until that is corrected: purity, drive",
+        "not checked until that is corrected: purity, batch, drive",
         f"{OWN}:HasNoReset: 1 error",
     ]
 
