@@ -100,6 +100,7 @@ def checkout(tmp_path_factory):
             assert f"jetbot-mjx train {arguments}" in DOCUMENTED
             assert run("train", arguments.split()) == 0
         shutil.copytree("runs/mine", "runs/other")
+        shutil.copytree("runs/hopper", "runs/hopper-2")
         assert run("pretrained", []) == 0
     return folder
 
