@@ -15,11 +15,12 @@ from jetbot_mjx.evaluation.return_report import (
     ReturnComparison,
     ReturnReport,
     check_one_environment,
+    compare_code,
     compare_returns,
     return_curve,
 )
 from jetbot_mjx.evaluation.returns import ReturnEvaluator, return_baselines, summarize_returns
-from jetbot_mjx.runs import Checkpoint, Setup, check_writable
+from jetbot_mjx.runs import Checkpoint, Setup, check_writable, read_task_code
 from jetbot_mjx.terminal import stage
 
 _FOLDER = "evaluations"
@@ -87,7 +88,8 @@ def compare_return_runs(
         for (name, seed, checkpoint, setup), place in zip(policies, places, strict=True):
             by_run[name][seed] = reporter.write(checkpoint, setup, place)
             advance(1)
-    comparison = compare_returns(folder.absolute(), by_run)
+    code = compare_code({name: read_task_code(one.run_dir) for name, one in firsts.items()})
+    comparison = compare_returns(folder.absolute(), by_run, code)
     with stage("writing the comparison"):
         write_return_comparison(comparison)
     return comparison

@@ -26,7 +26,7 @@ from jetbot_mjx.evaluation.evaluator import json_values
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.returns import ReturnSummary
 from jetbot_mjx.evaluation.rollout import ReturnEpisodes
-from jetbot_mjx.runs import JsonObject, MetricValues, shortened
+from jetbot_mjx.runs import JsonObject, MetricValues, TaskCode, shortened
 
 _SETTINGS = (
     "environment",
@@ -155,6 +155,8 @@ class ReturnComparison(NamedTuple):
     pairs: tuple[ReturnPair, ...]
     differences: Mapping[str, Sequence[object]]
     """Values of each run, by key, for the settings in which runs differ besides the seed."""
+    other_code: Sequence[str]
+    """One line for each run whose environment has other code than that of the first."""
     baselines: Mapping[str, ReturnSummary]
     versions: JsonObject
 
@@ -227,14 +229,46 @@ def _shared(config: Config) -> JsonObject:
     }
 
 
+def compare_code(codes: Mapping[str, TaskCode | None]) -> tuple[str, ...]:
+    """Tell which runs have an environment of the same name and of other code.
+
+    Args:
+      codes: the source that each run stored, by the name of the run.
+
+    Returns:
+      One line for each run that differs from the first, with the files that do.
+    """
+    files = {name: dict(code.files) if code else {} for name, code in codes.items()}
+    (first, wanted), *others = files.items()
+    lines = []
+    for name, found in others:
+        paths = sorted(path for path in {*wanted, *found} if wanted.get(path) != found.get(path))
+        if paths:
+            # A file that both have is not the same; another one is of one of them alone.
+            told = ", ".join(
+                f"{path} differs"
+                if path in wanted and path in found
+                else f"only {first if path in wanted else name} has {path}"
+                for path in paths
+            )
+            lines.append(
+                f"the environments of {first} and {name} are not the same code: {told}: their"
+                " returns may not be comparable"
+            )
+    return tuple(lines)
+
+
 def compare_returns(
-    folder: Path, runs: Mapping[str, Mapping[str, ReturnReport]]
+    folder: Path,
+    runs: Mapping[str, Mapping[str, ReturnReport]],
+    other_code: Sequence[str] = (),
 ) -> ReturnComparison:
     """Compare runs on the starts on which all of them were evaluated.
 
     Args:
       folder: the folder for the files of the comparison.
       runs: for each run by name, the report of each seed by name; all on the same starts.
+      other_code: a result of `compare_code`.
     """
     rows = tuple(_run(name, seeds) for name, seeds in runs.items())
     first = next(iter(rows[0].seeds.values()))
@@ -247,6 +281,7 @@ def compare_returns(
         differences=differing_settings(
             [next(iter(seeds.values())).config for seeds in runs.values()]
         ),
+        other_code=other_code,
         baselines=first.baselines,
         versions=first.versions,
     )

@@ -48,6 +48,7 @@ def summarize_return_comparison(comparison: ReturnComparison) -> str:
             f" improvement {_estimate(result.improvement, '{:.0%}')},"
             f" starts {result.wins} : {result.losses} (p {result.p:.2g})"
         )
+    lines += comparison.other_code
     return "\n".join([*lines, f"report: {comparison.folder / 'comparison.html'}"])
 
 

@@ -59,6 +59,7 @@ from .run_finder import scan_runs as scan_runs
 from .setup import Setup as Setup
 from .task_code import TaskCode as TaskCode
 from .task_code import collect_task_code as collect_task_code
+from .task_code import read_task_code as read_task_code
 from .task_code import stored_class as stored_class
 from .task_code import write_task_code as write_task_code
 from .train_log import TRAIN_LOG as TRAIN_LOG

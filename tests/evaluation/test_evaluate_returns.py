@@ -11,7 +11,8 @@ from helpers import point_mass
 from helpers.command_modules import evaluate
 from jetbot_mjx import library, training
 from jetbot_mjx.errors import InvalidError, UserError
-from jetbot_mjx.evaluation import compare_runs, evaluate_run
+from jetbot_mjx.evaluation import compare_runs, evaluate_returns, evaluate_run
+from jetbot_mjx.runs import TaskCode
 
 EPISODES = 32
 
@@ -91,6 +92,28 @@ def test_a_comparison_is_over_seeds_and_episodes(folder, compared):
     lines = compared.splitlines()
     assert re.match(r"one: success \d+\.\d\d% is below the 100.00% asked for", lines[-2])
     assert lines[-3] == f"report: {home / 'comparison.html'}"
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_a_comparison_tells_that_the_code_is_not_the_same(folder, tmp_path, monkeypatch, capsys):
+    # Each run stores the code that it was trained in; these two stored none.
+    stored = {"one": b"mass = 1", "two": b"mass = 2"}
+
+    def read_code(run_dir):
+        name = next(x for x in stored if x in run_dir.parts)
+        return TaskCode("mass", (("mass.py", stored[name]),))
+
+    monkeypatch.setattr(evaluate_returns, "read_task_code", read_code)
+    arguments = [str(folder / name) for name in stored]
+    evaluate.main([*arguments, "--episodes", "2", "--output", str(tmp_path)])
+    told = (
+        "the environments of one and two are not the same code: mass.py differs: their returns may"
+        " not be comparable"
+    )
+    assert told in capsys.readouterr().out.splitlines()
+    assert read(tmp_path / "comparison.json")["other_code"] == [told]
+    for page in ("comparison.html", "comparison.md"):
+        assert told in (tmp_path / page).read_text("utf-8")
 
 
 @pytest.mark.usefixtures("blank_figures")

@@ -10,9 +10,11 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.return_report import (
     ReturnPoint,
     check_one_environment,
+    compare_code,
     compare_returns,
     return_curve,
 )
+from jetbot_mjx.runs import TaskCode
 
 
 def compared(**runs):
@@ -76,6 +78,22 @@ def test_runs_of_different_environments_are_refused(settings, key):
     check_one_environment({"a": one.config, "b": one.config})
     with pytest.raises(UserError, match=key):
         check_one_environment({"a": one.config, "b": other.config})
+
+
+def test_runs_with_other_code_of_one_name_are_told():
+    code = {
+        "a": TaskCode("env", (("env.py", b"1"), ("terms.py", b"2"))),
+        "b": TaskCode("env", (("env.py", b"1"), ("terms.py", b"2"))),
+        "c": TaskCode("env", (("env.py", b"3"), ("other.py", b"2"))),
+        "installed": None,
+    }
+    assert compare_code({name: code[name] for name in ("a", "b")}) == ()
+    assert compare_code(code) == (
+        "the environments of a and c are not the same code: env.py differs, only c has other.py,"
+        " only a has terms.py: their returns may not be comparable",
+        "the environments of a and installed are not the same code: only a has env.py, only a has"
+        " terms.py: their returns may not be comparable",
+    )
 
 
 def test_reports_and_comparisons_are_shown_in_one_line():
