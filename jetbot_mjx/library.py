@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 _FITTING = {
     "strip": ("many",),
-    "gallery": ("episodes",),
-    "many": ("which",),
-    "goals": ("which",),
-    "episodes": ("which",),
+    "gallery": ("episodes", "size"),
+    "many": ("which", "size"),
+    "goals": ("which", "size"),
+    "episodes": ("which", "size"),
 }
 """The arguments of `render` that say what to render, with those that may be given beside them."""
 
@@ -159,6 +159,7 @@ def render(
     many: int | None = None,
     gallery: bool = False,
     strip: bool = False,
+    size: tuple[int, int] | None = None,
     verbose: bool = False,
 ) -> "viewers.Rendered":
     """Render a policy that drives to the fixed goals: a video, a GIF and a plot.
@@ -173,6 +174,7 @@ def render(
       gallery: whether to render the first, the middle and the last checkpoint side by side.
       strip: whether to render an image of an untrained, an early and a trained policy; `many` is
         then the number of robots of each.
+      size: the width and height of the video, even numbers of pixels (default: 1280 and 720).
       verbose: whether to show the progress.
 
     Returns:
@@ -189,6 +191,7 @@ def render(
         "goals": goals is not None,
         "episodes": episodes is not None,
         "which": which != "best",
+        "size": size is not None,
     }
     chosen = next((name for name in _FITTING if given[name]), "episodes")
     for name in given:
@@ -199,11 +202,13 @@ def render(
             return viewers.render_training_strip(find_run(run), robots=16 if many is None else many)
         if gallery:
             return viewers.render_gallery(
-                find_run(run), episodes=4 if episodes is None else episodes
+                find_run(run), episodes=4 if episodes is None else episodes, size=size
             )
         if many is not None:
-            return viewers.render_many(find_run(run), robots=many, which=which)
-        return viewers.render_run(find_run(run), episodes=episodes, goals=goals, which=which)
+            return viewers.render_many(find_run(run), robots=many, which=which, size=size)
+        return viewers.render_run(
+            find_run(run), episodes=episodes, goals=goals, which=which, size=size
+        )
 
 
 def tune(

@@ -208,7 +208,7 @@ def small_videos(monkeypatch):
     """Videos have few frames, and small ones, where nobody looks at them."""
     from jetbot_mjx.viewers import gallery, video
 
-    small = functools.partial(video.VideoRenderer, side=64, fps=2)
+    small = functools.partial(video.VideoRenderer, size=(64, 64), fps=2)
     monkeypatch.setattr(gallery, "VideoRenderer", small)
 
 

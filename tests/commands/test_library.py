@@ -233,7 +233,7 @@ def test_a_loaded_checkpoint_has_a_short_repr(trained):
 
 def test_a_default_is_that_of_the_commands():
     assert inspect.signature(evaluate).parameters["episodes"].default == REPORT_GOALS
-    assert (gallery.VIDEO_EPISODES, gallery.GALLERY_EPISODES) == (20, 4)
+    assert (gallery.VIDEO_EPISODES, gallery.GALLERY_EPISODES) == (8, 4)
 
 
 # What they refuse.

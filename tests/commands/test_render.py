@@ -75,7 +75,7 @@ def evaluator(smoke_run):
 @pytest.fixture
 def coarse(monkeypatch):
     """Films in few and small pictures."""
-    monkeypatch.setattr(gallery, "VideoRenderer", functools.partial(VideoRenderer, side=80, fps=5))
+    monkeypatch.setattr(gallery, "VideoRenderer", functools.partial(VideoRenderer, fps=5))
 
 
 @pytest.fixture
@@ -84,8 +84,8 @@ def filmed(monkeypatch):
     shots = []
 
     class Listener:
-        def __init__(self, env):
-            pass
+        def __init__(self, env, size):
+            assert size[0] * size[1] > 1
 
         def __enter__(self):
             return self
@@ -118,13 +118,14 @@ def names(folder):
 
 
 def test_rendering_writes_a_video_a_gif_and_a_plot(run_copy, needs_opengl, coarse, capsys):
-    assert render.main([str(run_copy), "--episodes", "2"]) == 0
+    assert render.main([str(run_copy), "--episodes", "2", "--size", "160x90"]) == 0
     (folder,) = (run_copy / "videos").iterdir()
     film = iio.imread(folder / "episodes-2.mp4", plugin="pyav")
-    assert film.shape[1:] == (80, 160, 3)
+    assert film.shape[1:] == (90, 160, 3)
     assert film.shape[0] > 8
     assert np.abs(film[0].astype(int) - film[5]).mean() > 1  # it moves
-    assert iio.imread(folder / "episodes-2.gif").shape[1:] == (48, 96, 3)
+    assert np.abs(film[-1].astype(int) - film[0]).mean() < 6  # its end fades into its start
+    assert iio.imread(folder / "episodes-2.gif").shape[1:] == (90, 160, 3)
     assert iio.imread(folder / "trajectories-2.png").shape[0] > 400
     shown = capsys.readouterr().out
     for name in ("episodes-2.mp4", "episodes-2.gif", "trajectories-2.png"):
@@ -178,6 +179,9 @@ def test_goals_are_written_as_indices_and_ranges(text, goals, name):
         (["--goals", "7-3"], "7-3 is a reversed range: write 3-7"),
         (["--goals", "3,1-4"], "goal 3 is given twice: give it once"),
         (["--goals", "3", "--episodes", "2"], "--episodes: not allowed with argument --goals"),
+        (["--size", "1280"], "'1280' is not a size: give two even numbers from 64 to 4096"),
+        (["--size", "641x360"], "'641x360' is not a size"),
+        (["--size", "9998x2"], "such as 1280x720"),
         (["--gallery", "--goals", "3"], "--goals: cannot be combined with --gallery"),
         (["--gallery", "--checkpoint", "last"], "--checkpoint: cannot be combined with --gallery"),
     ],
@@ -254,11 +258,11 @@ def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys, s
 
 
 def test_a_gallery_has_a_video_an_animation_and_a_sheet(run_copy, needs_opengl, coarse):
-    rendered = render_gallery(run_copy, episodes=2)
+    rendered = render_gallery(run_copy, episodes=2, size=(242, 80))
     film = iio.imread(rendered.files["video"], plugin="pyav")
     assert film.shape[1:] == (80, 240, 3)
     assert names(run_copy / "videos") == ["gallery-2.gif", "gallery-2.mp4", "gallery-2.png"]
-    assert iio.imread(rendered.files["gif"]).shape[1:] == (60, 180, 3)
+    assert iio.imread(rendered.files["gif"]).shape[1:] == (80, 240, 3)
     height, width, _ = iio.imread(rendered.files["plots"]).shape
     assert width == 3 * height
     assert list(rendered.successes) == [0, 32_768, 65_536]

@@ -150,11 +150,10 @@ def test_a_strip_shows_the_first_one_that_fails_and_the_last():
 def test_many_robots_and_a_strip_are_rendered(
     smoke_run, tmp_path, needs_opengl, monkeypatch, capsys
 ):
-    monkeypatch.setattr(many, "_SIZE", (160, 96))
     monkeypatch.setattr(many, "FPS", 2)
     run = shutil.copytree(smoke_run, tmp_path / "run")
     with gliding.everywhere():
-        assert render.main([str(run), "--many", "2"]) == 0
+        assert render.main([str(run), "--many", "2", "--size", "160x96"]) == 0
     (gif,) = run.glob("videos/*/many-2.gif")
     assert gif.stat().st_size <= many.MAX_GIF_BYTES
     assert iio.imread(gif.with_suffix(".mp4"), plugin="pyav").shape[1:] == (96, 160, 3)
@@ -177,6 +176,7 @@ def test_many_robots_and_a_strip_are_rendered(
         (["--strip", "--gallery"], "--strip: cannot be combined with --gallery"),
         (["--strip", "--goals", "3"], "--goals: cannot be combined with --strip"),
         (["--strip", "--episodes", "3"], "--episodes: cannot be combined with --strip"),
+        (["--strip", "--size", "64x64"], "--size: cannot be combined with --strip"),
         (["--strip", "--checkpoint", "last"], "--checkpoint: cannot be combined with --strip"),
     ],
 )

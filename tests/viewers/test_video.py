@@ -7,6 +7,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
@@ -27,7 +28,7 @@ from jetbot_mjx.viewers.video import (
     write_mp4,
 )
 
-SIDE, FPS = 120, 10.0
+SIDE, FPS = 240, 10.0
 DT = 1 / 60
 
 
@@ -54,7 +55,7 @@ def drive(world_env):
 
 @pytest.fixture(scope="module")
 def renderer(world_env, needs_opengl):
-    with VideoRenderer(world_env, SIDE, FPS) as renderer:
+    with VideoRenderer(world_env, (SIDE, SIDE), FPS) as renderer:
         yield renderer
 
 
@@ -115,7 +116,7 @@ def test_goal_time_distance_and_outcome_are_written_in(renderer, drive, written,
     assert written[:2] == ["goal 7 0.00 s", "0.58 m to go"]
     assert written[-3:] == ["goal 7 0.50 s", "0.30 m to go", outcome]
     assert written.count(outcome) == 1
-    assert frames[0].shape == (SIDE, 2 * SIDE, 3)
+    assert frames[0].shape == (SIDE, SIDE, 3)
     # Real time, and then it stands for a while.
     assert len(frames) == 1 + 0.5 * FPS + round(video.HOLD_SECONDS * FPS)
     assert all(np.array_equal(frames[5], frame) for frame in frames[6:])
@@ -155,33 +156,63 @@ def test_the_edges_of_shadows_are_fine(renderer):
     assert width / model.vis.quality.shadowsize < 0.004  # [m]; a pixel of the chase view is 3 mm
 
 
-def test_text_and_inset_stay_above_what_happens(renderer, drive):
+@pytest.mark.parametrize("size", [(240, 240), (426, 240), (320, 400)])
+def test_text_and_inset_stay_above_what_happens(world_env, drive, size, needs_opengl):
     """Their pixels are those that differ from the bare view."""
     one = drive((1.5, 1.5), (-1.0, -0.5), number=1023, reached=False)
-    points = video._extent(one)
-    camera = offscreen.overview(points, 45.0, **video._FILLED)
-    panel = renderer._episode_view("123,456,789 steps", one, one.steps, camera)
-    bare = renderer._view.frame(
-        one.qpos[-1], one.markers, camera, shadows=False, trail_w=one.trail_w(one.steps)
-    )
-    rows, columns = np.nonzero((panel != bare).any(axis=-1)[:, :-1])
-    assert rows.min() < 0.05 * SIDE
-    assert rows.max() < (1 - video._FILLED["above"]) / 2 * SIDE
-    assert columns.max() > 0.9 * SIDE
-    # And they are not on top of each other: bare columns lie between them.
-    assert set(range(columns.max())) - set(columns)
+    with VideoRenderer(world_env, size, FPS) as renderer:
+        camera = renderer._overview([one])
+        panel = renderer._episode_view("123,456,789 steps", one, camera, one.steps)
+        bare = renderer._view.frame(
+            one.qpos[-1],
+            one.markers,
+            camera,
+            trail_w=one.trail_w(one.steps),
+            lines_w=offscreen.METRE_LABELS,
+        )
+    rows, columns = np.nonzero(np.abs(panel.astype(int) - bare).max(axis=-1) > 3)
+    assert rows.min() < 0.05 * size[1]
+    assert rows.max() < (1 - video._FILLED["above"]) / 2 * size[1]
+    assert columns.max() > 0.9 * size[0]
 
 
 def test_the_inset_is_what_the_robot_sees(renderer, drive):
     def red_in_corner(goal_w):
         one = drive((0.0, 0.2), goal_w)
         frame = next(renderer.render_episode(one)).astype(int)
-        corner = frame[-round(0.28 * SIDE) :, SIDE - round(0.34 * SIDE) : SIDE]
+        corner = frame[: round(0.28 * SIDE), SIDE - round(0.34 * SIDE) : SIDE]
         r, g, b = np.moveaxis(corner, -1, 0)
         return int(((r > 90) & (r > 3 * g) & (r > 3 * b)).sum())
 
     assert red_in_corner((0.3, 0.0)) > 5
     assert red_in_corner((-0.9, 0.0)) == 0
+
+
+def test_the_floor_has_a_thick_line_each_metre_and_a_thin_one_each_quarter(world_env, needs_opengl):
+    """Seen from above: along x at y = 0.125, between the lines that are parallel to it."""
+    model = offscreen.with_metre_grid(world_env.mj_model)
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = 0.125, 0.0, 0.0
+    camera.distance, camera.elevation, camera.azimuth = 2.0, -90.0, 0.0
+    away = {"goal": (9.0, 9.0, 0.0)}
+    qpos = model.qpos0 + np.eye(model.nq)[0] * 9
+    with offscreen.Renderer(model, width=800, height=100) as renderer:
+        image = renderer.frame(qpos, away, camera, shadows=False)
+    row = image[20].mean(axis=-1)
+    scale = 50 / (2.0 * np.tan(np.radians(model.vis.global_.fovy) / 2))  # [pixels/m]
+    place = (np.arange(800) - 399.5) / scale
+    # Thin lines are fainter than a pixel is wide.
+    lines, thick = place[row < row.max() - 1], place[row < row.max() - 30]
+    assert set(np.round(4 * lines[np.abs(lines) < 2.1])) == set(range(-8, 9))
+    assert set(np.round(4 * thick[np.abs(thick) < 2.1])) == {-8, -4, 0, 4, 8}
+    assert model.tex_data.sum() != world_env.mj_model.tex_data.sum()
+
+
+def test_videos_are_joined_to_a_loop():
+    black, grey, white = (np.full((2, 2, 3), value, np.uint8) for value in (0, 100, 200))
+    joined = [int(frame[0, 0, 0]) for frame in video.join([[black, grey], [white]], 3)]
+    assert joined == [0, 100, 125, 150, 175, 200, 150, 100, 50]
+    assert list(video.join([[], []])) == []
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +221,7 @@ def seeing_env():
     return make_env(parse_config(config))
 
 
-def test_what_a_policy_sees_is_in_the_upper_left_corner(
+def test_what_a_policy_sees_is_in_the_upper_right_corner(
     seeing_env, drive, written, places, needs_opengl
 ):
     one = drive((0.0, 0.2), (0.3, 0.1))
@@ -198,20 +229,19 @@ def test_what_a_policy_sees_is_in_the_upper_left_corner(
     qpos = jnp.asarray(one.qpos[0])
     seen = np.asarray(camera.render(camera.pose(qpos[QPOS_XYZ], qpos[QPOS_QUAT]), one.markers))
     assert ((seen[..., 0] > 90) & (seen[..., 1] < 40)).any()  # the cube
-    with VideoRenderer(seeing_env, SIDE, FPS) as renderer:
+    with VideoRenderer(seeing_env, (SIDE, SIDE), FPS) as renderer:
         frame = next(renderer.render_episode(one))
-        margin, border, square = round(0.03 * SIDE), 2, 2
-        inner = frame[margin + border :, margin + border :][: 12 * square, : 16 * square]
+        margin, border, square = round(0.03 * SIDE), 2, 3
+        right = SIDE - margin - border
+        inner = frame[margin + border :, right - 16 * square : right][: 12 * square]
         np.testing.assert_allclose(inner[::square, ::square].astype(int), seen, atol=1)
         np.testing.assert_array_equal(inner[::square], inner[1::square])
-        assert (frame[margin : margin + border, margin : margin + 2 * border + 32] == 255).all()
-        # The text is beside it; of several views, each has its own at the upper right.
+        assert (frame[margin : margin + border, right - 16 * square : right] == 255).all()
+        # The text is at the upper left, of each of several views too.
         assert written[0] == "goal 7 0.00 s"
-        assert {x for x, _ in places} == {margin + 2 * border + 32 + margin}
-        places.clear()
+        assert max(x for x, _ in places) < SIDE / 4
         views = next(renderer.render_side_by_side([("0 steps", one), ("9 steps", one)]))
-        assert {x for x, _ in places} == {margin}
-        corner = views[margin + border :, : SIDE - margin - border][: 12 * square, -16 * square :]
+        corner = views[margin + border :, right - 16 * square : right][: 12 * square]
         np.testing.assert_array_equal(corner, inner)
 
 
