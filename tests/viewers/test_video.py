@@ -231,7 +231,7 @@ def test_what_a_policy_sees_is_in_the_upper_right_corner(
     assert ((seen[..., 0] > 90) & (seen[..., 1] < 40)).any()  # the cube
     with VideoRenderer(seeing_env, (SIDE, SIDE), FPS) as renderer:
         frame = next(renderer.render_episode(one))
-        margin, border, square = round(0.03 * SIDE), 2, 3
+        margin, border, square = round(0.03 * SIDE), 2, 4
         right = SIDE - margin - border
         inner = frame[margin + border :, right - 16 * square : right][: 12 * square]
         np.testing.assert_allclose(inner[::square, ::square].astype(int), seen, atol=1)
