@@ -29,6 +29,11 @@ from .nan_dump import save_nan_dump as save_nan_dump
 from .resumption import Resumption as Resumption
 from .resumption import resume as resume
 from .resumption import to_trees as to_trees
+from .run_changes import changed_settings as changed_settings
+from .run_changes import compare_two as compare_two
+from .run_changes import delete_run as delete_run
+from .run_dir import CONFIG as CONFIG
+from .run_dir import DamagedRunError as DamagedRunError
 from .run_dir import JsonObject as JsonObject
 from .run_dir import atomic_folder as atomic_folder
 from .run_dir import changed_versions as changed_versions
@@ -50,10 +55,12 @@ from .run_dir import write_text as write_text
 from .run_dir import writing_to as writing_to
 from .run_finder import PRETRAINED as PRETRAINED
 from .run_finder import ROOT as ROOT
+from .run_finder import RunInfo as RunInfo
 from .run_finder import copy_pretrained as copy_pretrained
 from .run_finder import explain_missing as explain_missing
 from .run_finder import find_run as find_run
 from .run_finder import find_run_config as find_run_config
+from .run_finder import read_info as read_info
 from .run_finder import runs_table as runs_table
 from .run_finder import scan_runs as scan_runs
 from .setup import Setup as Setup
