@@ -14,6 +14,7 @@ import contextlib
 import difflib
 import functools
 import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Collection, Sequence
@@ -358,6 +359,19 @@ def goals(text: str) -> list[int]:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
+def size(text: str) -> tuple[int, int]:
+    """Parse an argument that is a width and a height, which videos need to be even."""
+    least, most = 64, 4096
+    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
+    sides = (int(found[1]), int(found[2])) if found else (0, 0)
+    if any(side % 2 or not least <= side <= most for side in sides):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a size: give two even numbers from {least} to {most}, such"
+            " as 1280x720"
+        )
+    return sides
+
+
 def origin(text: str) -> str:
     """Parse an argument that is a page's origin, as browsers write it."""
     import urllib.parse
@@ -377,6 +391,14 @@ def origin(text: str) -> str:
     default = {"http": 80, "https": 443}[parts.scheme]
     host = f"[{name}]" if ":" in name else name
     return f"{parts.scheme}://{host}" + ("" if port in (None, default) else f":{port}")
+
+
+def open_page(path: Path) -> None:
+    """Open a file in the browser, or print that there is none."""
+    import webbrowser
+
+    if not webbrowser.open(path.resolve().as_uri()):
+        tell("no browser was found: open this file in one")
 
 
 def find_policy(name: str) -> Path:

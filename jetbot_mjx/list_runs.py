@@ -4,36 +4,27 @@
 in, and `--delete NAME` removes one after a question.
 """
 
-import argparse
-import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from jetbot_mjx import cli, errors, startup
-
-if TYPE_CHECKING:
-    from jetbot_mjx.runs import DamagedRunError, RunInfo
 
 _SORTS = ("age", "name", "steps", "success")
 
 
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx runs", description=__doc__)
-    parser.add_argument(
-        "folder", type=Path, nargs="?", metavar="DIR", help="folder of the runs (default: runs)"
-    )
-    parser.add_argument(
-        "--filter", metavar="TEXT", help="list only runs whose name or task contains this text"
-    )
+    folder = "folder of the runs (default: runs)"
+    parser.add_argument("folder", type=Path, nargs="?", metavar="DIR", help=folder)
+    text = "list only runs whose name or task contains this text"
+    parser.add_argument("--filter", metavar="TEXT", default="", help=text)
     cli.add_choice(parser, "--sort", _SORTS, "order of the list")
     cli.add_flag(parser, "--json", "print the list as JSON")
     action = parser.add_mutually_exclusive_group()
     action.add_argument("--open", metavar="RUN", help="open the newest report of a run")
-    action.add_argument(
-        "--compare", nargs=2, metavar="RUN", help="show what two runs differ in: settings, results"
-    )
+    two = "show the settings and results in which two runs differ"
+    action.add_argument("--compare", nargs=2, metavar="RUN", help=two)
     action.add_argument("--delete", metavar="RUN", help="delete a run, after a question")
     cli.add_flag(parser, "--yes", "delete without a question")
     return parser
@@ -52,72 +43,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.yes and not options.delete:
         parser.error("--yes: it belongs to --delete")
-    with startup.exit_on_interrupt():
-        from jetbot_mjx.runs import compare_two
-
     if options.folder and not options.folder.is_dir():
         parser.error(f"{options.folder} is not a folder")
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.runs import compare_two, list_runs, newest_report
+
     if options.open:
-        _open_report(cli.find_policy(options.open))
+        report = newest_report(cli.find_policy(options.open))
+        cli.tell(f"report: {report}")
+        cli.open_page(report)
     elif options.compare:
         cli.tell(compare_two(*map(cli.find_policy, options.compare)))
     elif options.delete:
         _delete(options.delete, asks=not options.yes)
     else:
-        _list(options)
+        how = {"text": options.filter, "sort": options.sort, "as_json": options.json}
+        cli.tell(list_runs(options.folder, **how))
     return 0
-
-
-def _list(options: argparse.Namespace) -> None:
-    """Print the runs of a folder, and without one those that come with the package."""
-    from jetbot_mjx.runs import PRETRAINED, ROOT, runs_table, scan_runs
-
-    def chosen(folder: Path) -> "tuple[list[RunInfo], list[DamagedRunError]]":
-        found, damaged = scan_runs(folder)
-        wanted = (options.filter or "").lower()
-        found = [run for run in found if wanted in f"{run.name} {run.task}".lower()]
-        if options.sort != "age":
-            found.sort(key=_order(options.sort))
-        return found, [] if wanted else damaged
-
-    found, damaged = chosen(options.folder or ROOT)
-    if options.json:
-        cli.tell(json.dumps([run.to_json() for run in found], indent=2))
-        return
-    cli.tell(runs_table(found, damaged))
-    if not options.folder:
-        cli.tell(
-            "\nwith the package, for every command that takes a run:\n"
-            f"{runs_table(*chosen(PRETRAINED))}"
-        )
-
-
-def _order(sort: str) -> "Callable[[RunInfo], str | float]":
-    """Return the key of an order, in which the best or longest run is the first."""
-    orders: dict[str, Callable[[RunInfo], str | float]] = {
-        "name": lambda run: run.name,
-        "steps": lambda run: -run.env_steps,
-        "success": lambda run: -(run.success_rate or 0.0),
-    }
-    return orders[sort]
-
-
-def _open_report(run: Path) -> None:
-    """Open the newest report of a run in the browser.
-
-    Raises:
-      UserError: there is none.
-    """
-    import webbrowser
-
-    pages = sorted(run.glob("evaluations/*/report.html"), key=lambda page: page.stat().st_mtime)
-    if not pages:
-        raise errors.NotFoundError(
-            f"{run} has no report: write one with `{cli.PROGRAM} evaluate {run}`"
-        )
-    cli.tell(f"report: {pages[-1]}")
-    if not webbrowser.open(pages[-1].resolve().as_uri()):
-        cli.tell("no browser was found: open this file in one")
 
 
 def _delete(name: str, *, asks: bool) -> None:
@@ -126,23 +68,18 @@ def _delete(name: str, *, asks: bool) -> None:
     Raises:
       UserError: it is not a run of the user, a training writes it, or nobody can be asked.
     """
-    from jetbot_mjx.runs import CONFIG, PRETRAINED, delete_run, read_info
+    from jetbot_mjx.runs import delete_run, find_deletable
 
-    path = cli.find_policy(name)
-    if path.resolve().parent == PRETRAINED.resolve():
-        raise errors.UserError(f"--delete {name}: it comes with the package and stays")
-    if not (path / CONFIG).is_file():
-        raise errors.NotFoundError(f"--delete {name}: there is no run in {path}")
-    run = read_info(path)
+    run = find_deletable(cli.find_policy(name))
     if asks:
         if not sys.stdin.isatty():
             raise errors.UserError(f"--delete {name}: nobody can be asked here: add --yes")
-        answer = input(f"delete {path}, {run.env_steps:,} steps of {run.task}? [y/N] ")
+        answer = input(f"delete {run.path}, {run.env_steps:,} steps of {run.task}? [y/N] ")
         if answer.strip().lower() not in ("y", "yes"):
             cli.tell("nothing was deleted")
             return
     delete_run(run)
-    cli.tell(f"deleted: {path}")
+    cli.tell(f"deleted: {run.path}")
 
 
 if __name__ == "__main__":

@@ -72,15 +72,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _open_page(run: Path, which: Literal["best", "last"] | int) -> int:
     """Write the page of a run, and open it in the browser."""
     with startup.exit_on_interrupt():
-        import webbrowser
-
         from jetbot_mjx.deployment import summarize_web_page, write_web_page
     cli.prepare_device()
     with cli.show_progress():
         page = write_web_page(run, which=which)
     cli.tell(summarize_web_page(page))
-    if not webbrowser.open(page.path.resolve().as_uri()):
-        cli.tell("no browser was found: open this file in one")
+    cli.open_page(page.path)
     return 0
 
 

@@ -7,13 +7,10 @@ image of an untrained, an early and a trained policy.
 """
 
 import argparse
-import re
 from collections.abc import Sequence
 
 from jetbot_mjx import cli, startup
 from jetbot_mjx.evaluation import REPORT_GOALS
-
-_SIDES = (64, 4096)  # [pixels] smallest and largest side of a video
 
 
 def _parser() -> cli.Parser:
@@ -35,20 +32,8 @@ def _parser() -> cli.Parser:
     cli.add_flag(parser, "--gallery", gallery)
     cli.add_flag(parser, "--strip", "one image of an untrained, an early and a trained policy")
     size = "width and height of the video in pixels (default: 1280x720, with --gallery 1280x480)"
-    parser.add_argument("--size", type=_size, metavar="WxH", help=size)
+    parser.add_argument("--size", type=cli.size, metavar="WxH", help=size)
     return parser
-
-
-def _size(text: str) -> tuple[int, int]:
-    """Parse an argument that is a width and a height, which videos need to be even."""
-    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
-    size = (int(found[1]), int(found[2])) if found else (0, 0)
-    if any(side % 2 or not _SIDES[0] <= side <= _SIDES[1] for side in size):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a size: give two even numbers from {_SIDES[0]} to {_SIDES[1]}, such"
-            " as 1280x720"
-        )
-    return size
 
 
 def _check(parser: cli.Parser, options: argparse.Namespace) -> None:

@@ -1,31 +1,61 @@
-"""Say what changed from one run to another, and delete a run."""
+"""List runs, say what changed from one to another, open the report of one, and delete one."""
 
+import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
-from jetbot_mjx.config import Setting
-from jetbot_mjx.errors import os_errors
-from jetbot_mjx.runs.run_dir import occupied, read_config
-from jetbot_mjx.runs.run_finder import RunInfo, format_score, read_info
+from jetbot_mjx.errors import NotFoundError, UserError, os_errors
+from jetbot_mjx.runs.run_dir import CONFIG, DamagedRunError, occupied, read_config
+from jetbot_mjx.runs.run_finder import (
+    PRETRAINED,
+    ROOT,
+    RunInfo,
+    format_score,
+    read_info,
+    runs_table,
+    scan_runs,
+)
 from jetbot_mjx.terminal import text_table
 
+_ORDERS: dict[str, Callable[[RunInfo], str | float]] = {
+    "age": lambda run: -run.changed,
+    "name": lambda run: run.name,
+    "steps": lambda run: -run.env_steps,
+    "success": lambda run: -(run.success_rate or 0.0),
+}
 
-def changed_settings(before: Path, after: Path) -> dict[str, tuple[Setting, Setting]]:
-    """Return the settings in which two runs differ, by their full key; None where one has none.
+
+def list_runs(
+    folder: Path | None = None,
+    *,
+    text: str = "",
+    sort: Literal["age", "name", "steps", "success"] = "age",
+    as_json: bool = False,
+) -> str:
+    """Return a list of runs.
 
     Args:
-      before: the folder of one run.
-      after: the folder of the other.
-
-    Raises:
-      DamagedRunError: the configuration of one cannot be read.
+      folder: the folder of the runs; None: `ROOT`, and those that come with the package as well.
+      text: list only runs whose name or task contains it, in capitals or not.
+      sort: the order: the latest, the longest or the most successful first, or by name.
+      as_json: whether to return JSON, with the runs of `folder` alone.
     """
-    old, new = (read_config(folder).flat() for folder in (before, after))
-    return {
-        key: (old.get(key), new.get(key))
-        for key in {**old, **new}
-        if old.get(key) != new.get(key)
-    }
+
+    def chosen(folder: Path) -> tuple[list[RunInfo], list[DamagedRunError]]:
+        found, damaged = scan_runs(folder)
+        found = [run for run in found if text.lower() in f"{run.name} {run.task}".lower()]
+        return sorted(found, key=_ORDERS[sort]), [] if text else damaged
+
+    found, damaged = chosen(folder or ROOT)
+    if as_json:
+        return json.dumps([run.to_json() for run in found], indent=2)
+    table = runs_table(found, damaged)
+    if folder:
+        return table
+    shipped = runs_table(*chosen(PRETRAINED))
+    return f"{table}\n\nwith the package, for every command that takes a run:\n{shipped}"
 
 
 def compare_two(before: Path, after: Path) -> str:
@@ -44,10 +74,37 @@ def compare_two(before: Path, after: Path) -> str:
         ("steps", f"{one.env_steps:,}", f"{other.env_steps:,}"),
         ("best evaluation", format_score(one), format_score(other)),
     ]
-    changed = changed_settings(before, after)
-    rows += [(key, str(old), str(new)) for key, (old, new) in changed.items()]
+    old, new = (read_config(run.path).flat() for run in (one, other))
+    changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    rows += [(key, str(old.get(key, "-")), str(new.get(key, "-"))) for key in changed]
     table = text_table(rows)
     return table if changed else f"{table}\nall settings are equal"
+
+
+def newest_report(run: Path) -> Path:
+    """Return the page of the newest report of a run.
+
+    Raises:
+      NotFoundError: there is none.
+    """
+    pages = run.glob("evaluations/*/report.html")
+    newest = max(pages, key=lambda page: page.stat().st_mtime, default=None)
+    if newest is None:
+        raise NotFoundError(f"{run} has no report: write one with `jetbot-mjx evaluate {run}`")
+    return newest
+
+
+def find_deletable(path: Path) -> RunInfo:
+    """Return the run of the user in a folder.
+
+    Raises:
+      UserError: there is no run in it, or one that comes with the package.
+    """
+    if path.resolve().parent == PRETRAINED.resolve():
+        raise UserError(f"--delete {path.name}: it comes with the package and stays")
+    if not (path / CONFIG).is_file():
+        raise NotFoundError(f"--delete {path}: there is no run in this folder")
+    return read_info(path)
 
 
 def delete_run(run: RunInfo) -> None:

@@ -91,7 +91,7 @@ def test_a_run_is_deleted_after_a_question(runs, monkeypatch, capsys):
     ("arguments", "said"),
     [
         (["--delete", "pretrained:jetbot_egocentric"], "it comes with the package and stays"),
-        (["--delete", "runs"], "--delete runs: there is no run in runs"),
+        (["--delete", "runs"], "--delete runs: there is no run in this folder"),
     ],
 )
 def test_only_a_run_of_the_user_is_deleted(runs, arguments, said):
