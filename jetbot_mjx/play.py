@@ -24,6 +24,8 @@ def _parser() -> cli.Parser:
     cli.add_count(parser, "--seed", "random seed of the goals", least=0, default=0)
     web = "open a page that needs no server, in which another policy can be trained"
     parser.add_argument("--web", action="store_true", help=web)
+    text = "do not open the page"
+    parser.add_argument("--no-browser", dest="opens_page", action="store_false", help=text)
     # At most as many as two CPU cores still drive in real time.
     cli.add_count(parser, "--robots", "number of robots that drive at once", most=256, default=1)
     parser.add_argument(

@@ -377,7 +377,8 @@ def losses(history: Iterable[tuple[int, MetricValues]]) -> tuple[LossPoint, ...]
     """Extract the losses from the metrics of a training, as `learning_curve` does."""
     points = []
     for env_steps, metrics in history:
-        values = [metrics.get(name) for name in ("loss/policy", "loss/value", "policy/kl")]
-        if None not in values:
-            points.append(LossPoint(env_steps, *values))
+        names = ("loss/policy", "loss/value", "policy/kl")
+        policy, value, kl = (metrics.get(name) for name in names)
+        if policy is not None and value is not None and kl is not None:
+            points.append(LossPoint(env_steps, policy, value, kl))
     return tuple(points)
