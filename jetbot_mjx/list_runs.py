@@ -46,14 +46,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.folder and not options.folder.is_dir():
         parser.error(f"{options.folder} is not a folder")
     with startup.exit_on_interrupt():
-        from jetbot_mjx.runs import compare_two, list_runs, newest_report
+        from jetbot_mjx.runs import changes_table, compare_two, list_runs, newest_report
 
     if options.open:
         report = newest_report(cli.find_policy(options.open))
         cli.tell(f"report: {report}")
         cli.open_page(report)
     elif options.compare:
-        cli.tell(compare_two(*map(cli.find_policy, options.compare)))
+        cli.tell(changes_table(compare_two(*map(cli.find_policy, options.compare))))
     elif options.delete:
         _delete(options.delete, asks=not options.yes)
     else:

@@ -375,6 +375,7 @@ class _Reporter:
             fallbacks=checkpoint.about.get("fallbacks", ()),
             ranges=ranges if ranges.drawn else None,
             ranges_file=None if self._ranges_file is None else Path(self._ranges_file),
+            changes=runs.changes_since_the_run_before(checkpoint.run_dir),
             best_known=best_known,
             best_known_missing=missing,
             seen=self._moments.find(checkpoint.params, self._keys, finished)

@@ -21,7 +21,7 @@ from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
 from jetbot_mjx.evaluation.moments import SeenEpisode, moments_as_json
 from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
 from jetbot_mjx.evaluation.rollout import Episodes
-from jetbot_mjx.runs import JsonObject, MetricValues, shortened
+from jetbot_mjx.runs import JsonObject, MetricValues, RunChanges, shortened
 
 TIME_LIMIT = "time limit"
 ENDED_BY_TASK = "ended by the task"
@@ -171,6 +171,8 @@ class Report(NamedTuple):
     """Videos of some episodes; empty if none were requested, or none could be rendered."""
     clips_missing: str | None = None
     """Why no clips could be rendered."""
+    changes: RunChanges | None = None
+    """What the run changed from the one before it in the same folder; None without one."""
     losses: tuple[LossPoint, ...] = ()
     """Losses during the training; empty if the run folder holds none."""
 

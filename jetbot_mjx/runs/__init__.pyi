@@ -29,6 +29,9 @@ from .nan_dump import save_nan_dump as save_nan_dump
 from .resumption import Resumption as Resumption
 from .resumption import resume as resume
 from .resumption import to_trees as to_trees
+from .run_changes import RunChanges as RunChanges
+from .run_changes import changes_since_the_run_before as changes_since_the_run_before
+from .run_changes import changes_table as changes_table
 from .run_changes import compare_two as compare_two
 from .run_changes import delete_run as delete_run
 from .run_changes import find_deletable as find_deletable

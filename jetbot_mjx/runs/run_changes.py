@@ -2,9 +2,9 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from jetbot_mjx.errors import NotFoundError, UserError, os_errors
 from jetbot_mjx.runs.run_dir import CONFIG, DamagedRunError, occupied, read_config
@@ -58,27 +58,54 @@ def list_runs(
     return f"{table}\n\nwith the package, for every command that takes a run:\n{shipped}"
 
 
-def compare_two(before: Path, after: Path) -> str:
-    """Return a table of the results of two runs, and of the settings in which they differ.
+class RunChanges(NamedTuple):
+    """A `RunChanges` holds what two runs differ in."""
+
+    before: str
+    """Name of the one run; `after` is that of the other."""
+    after: str
+    results: Mapping[str, tuple[str, str]]
+    """Steps and best evaluation of both, as text."""
+    settings: Mapping[str, tuple[str, str]]
+    """The settings that differ, by their full key, as text."""
+
+
+def compare_two(before: Path, after: Path) -> RunChanges:
+    """Return the results of two runs, and the settings in which they differ.
 
     Args:
-      before: the folder of the run in the first column.
-      after: the folder of the run in the second column.
+      before: the folder of one run.
+      after: the folder of the other.
 
     Raises:
       DamagedRunError: the configuration or the metrics of one cannot be read.
     """
     one, other = read_info(before), read_info(after)
-    rows = [
-        ("", one.name, other.name),
-        ("steps", f"{one.env_steps:,}", f"{other.env_steps:,}"),
-        ("best evaluation", format_score(one), format_score(other)),
-    ]
+    results = {
+        "steps": (f"{one.env_steps:,}", f"{other.env_steps:,}"),
+        "best evaluation": (format_score(one), format_score(other)),
+    }
     old, new = (read_config(run.path).flat() for run in (one, other))
-    changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    rows += [(key, str(old.get(key, "-")), str(new.get(key, "-"))) for key in changed]
+    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    settings = {key: (str(old.get(key, "-")), str(new.get(key, "-"))) for key in keys}
+    return RunChanges(one.name, other.name, results, settings)
+
+
+def changes_table(changes: RunChanges) -> str:
+    """Return what two runs differ in as text, a line each."""
+    rows = [("", changes.before, changes.after)]
+    rows += [(key, *both) for key, both in {**changes.results, **changes.settings}.items()]
     table = text_table(rows)
-    return table if changed else f"{table}\nall settings are equal"
+    return table if changes.settings else f"{table}\nall settings are equal"
+
+
+def changes_since_the_run_before(run_dir: Path) -> RunChanges | None:
+    """Return what a run of the user changed from the one before it in the same folder, if any."""
+    if not (run_dir / CONFIG).is_file() or run_dir.parent == PRETRAINED:
+        return None
+    changed = read_info(run_dir).changed
+    earlier = [run for run in scan_runs(run_dir.parent)[0] if run.changed < changed]
+    return compare_two(earlier[0].path, run_dir) if earlier else None
 
 
 def newest_report(run: Path) -> Path:
