@@ -48,7 +48,7 @@ test-gpu: setup
 	$(BIN)/python tests/on_gpu.py
 
 test-slow: setup
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow -o faulthandler_timeout=7200
 
 check: setup
 	$(BIN)/ruff format --check .

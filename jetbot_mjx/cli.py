@@ -360,15 +360,15 @@ def goals(text: str) -> list[int]:
 
 
 def size(text: str) -> tuple[int, int]:
-    """Parse an argument that is a width and a height, which videos need to be even."""
-    least, most = 64, 4096
-    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
-    sides = (int(found[1]), int(found[2])) if found else (0, 0)
-    if any(side % 2 or not least <= side <= most for side in sides):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a size: give two even numbers from {least} to {most}, such"
-            " as 1280x720"
-        )
+    """Parse an argument that is the width and height of a video."""
+    found = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
+    if not found:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size: write it as in 1280x720")
+    sides = (int(found[1]), int(found[2]))
+    try:
+        errors.check_size(sides)
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
     return sides
 
 
@@ -450,6 +450,22 @@ def add_checkpoint_arguments(
         metavar="best|last|STEPS",
         help="which checkpoint of a run folder (default: best)",
     )
+    add_trust(parser)
+
+
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--trust`."""
+    text = (
+        "run the code that the run names, also if no training of yours on this machine has run it"
+    )
+    add_flag(parser, "--trust", text)
+
+
+def trusting(asked: bool) -> contextlib.AbstractContextManager[None]:
+    """Run the code that runs name inside the context, whoever wrote it, if `--trust` was given."""
+    from jetbot_mjx.runs import trusting
+
+    return trusting(asked)
 
 
 def add_config_arguments(

@@ -45,6 +45,19 @@ def check_count(name: str, value: object, most: float = math.inf) -> None:
         raise InvalidError(f"{name} = {value} is wrong: it should be at most {most}")
 
 
+def check_size(size: tuple[int, int]) -> None:
+    """Check that the width and height of a video can be encoded [pixels].
+
+    Raises:
+      InvalidError: They are not even numbers from 64 to 4096.
+    """
+    if len(size) != 2 or any(side % 2 or not 64 <= side <= 4096 for side in size):
+        told = "x".join(map(str, size))
+        raise InvalidError(
+            f"size = {told} is wrong: it should be two even numbers from 64 to 4096, as in 1280x720"
+        )
+
+
 @contextlib.contextmanager
 def os_errors(message: str, kind: type[UserError] = UserError) -> Iterator[None]:
     """Convert an `OSError` inside the context to a one-line error.

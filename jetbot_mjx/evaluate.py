@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # The other options are named as the arguments of the functions that evaluate.
     options = vars(_parser().parse_args(arguments))
     runs = [cli.find_policy(name) for name in options.pop("run")]
-    target = options.pop("min_success")
+    target, trust = options.pop("min_success"), options.pop("trust")
     with startup.exit_on_interrupt():
         from jetbot_mjx.evaluation import (
             below_target,
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from jetbot_mjx.runs import seed_folders
         from jetbot_mjx.viewers import make_clips
     cli.prepare_device()
-    with cli.show_progress():
+    with cli.trusting(trust), cli.show_progress():
         if len(runs) > 1 or seed_folders(runs[0]):
             result = compare_runs(runs, **options)
             text = summarize_comparison(result)

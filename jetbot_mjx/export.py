@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with startup.exit_on_interrupt():
         from jetbot_mjx.deployment import export_policy, summarize_export
     cli.prepare_device()
-    with cli.show_progress():
+    with cli.trusting(options.trust), cli.show_progress():
         exported = export_policy(
             run,
             formats=formats,
@@ -79,7 +79,7 @@ def _write_page(run: Path, options: argparse.Namespace) -> int:
     with startup.exit_on_interrupt():
         from jetbot_mjx.deployment import summarize_web_page, write_web_page
     cli.prepare_device()
-    with cli.show_progress():
+    with cli.trusting(options.trust), cli.show_progress():
         page = write_web_page(run, options.output, which=options.which)
     cli.tell(summarize_web_page(page))
     return 0

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Unpack, overload
 from jetbot_mjx import deployment, evaluation, runs, training, tuning, viewers
 from jetbot_mjx.config import Config, Overrides, load_config
 from jetbot_mjx.devices import require_device
-from jetbot_mjx.errors import InvalidError, UserError, check_count, ran_out
-from jetbot_mjx.runs import default_run_dir, find_run, find_run_config, seed_folders
+from jetbot_mjx.errors import InvalidError, UserError, check_count, check_size, ran_out
+from jetbot_mjx.runs import default_run_dir, find_run, find_run_config, seed_folders, trusting
 from jetbot_mjx.terminal import restart_clock, show_progress
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ def train(
     *,
     run_dir: str | Path | None = None,
     resume: str | Path | None = None,
+    trust: bool = False,
     verbose: bool = False,
 ) -> "training.Result":
     """Train a policy, from the beginning or from where the run in the folder was stopped.
@@ -59,6 +60,7 @@ def train(
       run_dir: the run folder: a new one, or that of a run with this configuration. None: a new one,
         `runs/<config>-<date>-<time>`.
       resume: a run to continue with its own configuration, in place of `config` and `run_dir`.
+      trust: whether to run the code that a run to continue names, whoever wrote it.
       verbose: whether to show the progress.
 
     Returns:
@@ -74,25 +76,31 @@ def train(
                 f"resume = {str(resume)!r} continues a run with its configuration in its folder:"
                 " leave out config and run_dir"
             )
-        run_dir = find_run(resume)
-        config = find_run_config(run_dir)
     elif config is None:
         raise InvalidError('give a configuration, as in train("jetbot"), or a run to resume')
-    if run_dir is None:
-        run_dir = default_run_dir(_name(config))
-    with _ready(verbose):
+    with _ready(verbose, trust):
+        if resume is not None:
+            run_dir = find_run(resume)
+            config = find_run_config(run_dir)
+        assert config is not None
+        run_dir = default_run_dir(_name(config)) if run_dir is None else Path(run_dir)
         restart_clock()
-        return training.run(load_config(config, overrides), Path(run_dir), verbose=verbose)
+        return training.run(load_config(config, overrides), run_dir, verbose=verbose)
 
 
 @overload
 def evaluate(
-    runs: str | Path, *, verbose: bool = ..., **options: "Unpack[evaluation.ReportOptions]"
+    runs: str | Path,
+    *,
+    trust: bool = ...,
+    verbose: bool = ...,
+    **options: "Unpack[evaluation.ReportOptions]",
 ) -> "evaluation.Report | evaluation.ReturnReport": ...
 @overload
 def evaluate(
     runs: Sequence[str | Path],
     *,
+    trust: bool = ...,
     verbose: bool = ...,
     **options: "Unpack[evaluation.ReportOptions]",
 ) -> "evaluation.Comparison | evaluation.ReturnComparison": ...
@@ -105,6 +113,7 @@ def evaluate(
     robustness: bool = False,
     ranges: str | Path | None = None,
     simulator: "evaluation.Simulator | None" = None,
+    trust: bool = False,
     verbose: bool = False,
 ) -> "_Evaluated":
     """Evaluate a policy on the fixed goals and write its report, or compare several runs.
@@ -120,6 +129,7 @@ def evaluate(
       ranges: a configuration file with ranges below `randomization`: evaluate also on one robot
         sampled from them for each goal. None: the ranges of the run, if any.
       simulator: `"mujoco"` to evaluate also in C MuJoCo.
+      trust: whether to run the code that the runs name, whoever wrote it.
       verbose: whether to show the progress.
 
     Returns:
@@ -138,7 +148,7 @@ def evaluate(
         "ranges": ranges,
         "simulator": simulator,
     }
-    with _ready(verbose):
+    with _ready(verbose, trust):
         if not isinstance(runs, str | Path):
             return evaluation.compare_runs([find_run(run) for run in runs], **options)
         run = find_run(runs)
@@ -160,6 +170,7 @@ def render(
     gallery: bool = False,
     strip: bool = False,
     size: tuple[int, int] | None = None,
+    trust: bool = False,
     verbose: bool = False,
 ) -> "viewers.Rendered":
     """Render a policy that drives to the fixed goals: a video, a GIF and a plot.
@@ -172,9 +183,9 @@ def render(
       goals: these of the fixed goals, such as `[3, 17]`, in place of `episodes`.
       many: that many robots in one scene, each with its own goal.
       gallery: whether to render the first, the middle and the last checkpoint side by side.
-      strip: whether to render an image of an untrained, an early and a trained policy; `many` is
-        then the number of robots of each.
-      size: the width and height of the video, even numbers of pixels (default: 1280 and 720).
+      strip: whether to draw an untrained, an early and a trained policy, `many` robots of each.
+      size: width and height of the video [pixels] (default: 1280, 720; of a gallery 1280, 480).
+      trust: whether to run the code that the run names, whoever wrote it.
       verbose: whether to show the progress.
 
     Returns:
@@ -197,18 +208,18 @@ def render(
     for name in given:
         if given[name] and name not in (chosen, *_FITTING[chosen]):
             raise InvalidError(f"render: {chosen} and {name} exclude each other")
-    with _ready(verbose):
+    if size is not None:
+        check_size(size)
+    with _ready(verbose, trust):
+        path = find_run(run)
         if strip:
-            return viewers.render_training_strip(find_run(run), robots=16 if many is None else many)
+            return viewers.render_training_strip(path, robots=16 if many is None else many)
         if gallery:
-            return viewers.render_gallery(
-                find_run(run), episodes=4 if episodes is None else episodes, size=size
-            )
+            episodes = 4 if episodes is None else episodes
+            return viewers.render_gallery(path, episodes=episodes, size=size)
         if many is not None:
-            return viewers.render_many(find_run(run), robots=many, which=which, size=size)
-        return viewers.render_run(
-            find_run(run), episodes=episodes, goals=goals, which=which, size=size
-        )
+            return viewers.render_many(path, robots=many, which=which, size=size)
+        return viewers.render_run(path, episodes=episodes, goals=goals, which=which, size=size)
 
 
 def tune(
@@ -275,14 +286,15 @@ def _name(config: str | Path | Config) -> Path:
 
 
 @contextlib.contextmanager
-def _ready(verbose: bool) -> Iterator[None]:
-    """Check that there is a device, and show the progress inside the context if asked to.
+def _ready(verbose: bool, trust: bool = False) -> Iterator[None]:
+    """Check that there is a device; show progress and trust runs inside the context if asked to.
 
     Raises:
       UserError: JAX has no usable device, or the device has too little memory.
     """
     require_device()
     with contextlib.ExitStack() as stack:
+        stack.enter_context(trusting(trust))
         if verbose:
             restart_clock()
             stack.enter_context(show_progress(sys.stderr))

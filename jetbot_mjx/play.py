@@ -59,24 +59,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = vars(_parser().parse_args(arguments))
     given = options.pop("run")
     run = cli.find_policy(given or f"pretrained:{_DEFAULT_POLICY}")
+    trust = options.pop("trust")
     if options.pop("web"):
-        return _open_page(run, options["which"])
+        return _open_page(run, options["which"], trust)
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import play_live
     cli.prepare_device()
     if given is None:
         cli.tell(f"no RUN given: playing pretrained:{_DEFAULT_POLICY}")
-    successes, episodes = play_live(run, **options, tell=cli.tell)
+    with cli.trusting(trust):
+        successes, episodes = play_live(run, **options, tell=cli.tell)
     cli.tell(f"{successes} of {episodes} goals reached")
     return 0
 
 
-def _open_page(run: Path, which: Literal["best", "last"] | int) -> int:
+def _open_page(run: Path, which: Literal["best", "last"] | int, trust: bool) -> int:
     """Write the page of a run, and open it in the browser."""
     with startup.exit_on_interrupt():
         from jetbot_mjx.deployment import summarize_web_page, write_web_page
     cli.prepare_device()
-    with cli.show_progress():
+    with cli.trusting(trust), cli.show_progress():
         page = write_web_page(run, which=which)
     cli.tell(summarize_web_page(page))
     cli.open_page(page.path)

@@ -17,7 +17,7 @@ def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx render", description=__doc__)
     cli.add_checkpoint_arguments(parser)
     group = parser.add_mutually_exclusive_group()
-    defaults = "default: 20; 4 with --gallery; 3 in an environment"
+    defaults = "default: 8; 4 with --gallery; 3 in an environment"
     first = f"drive to the first N of the fixed goals ({defaults})"
     cli.add_count(group, "--episodes", first, most=REPORT_GOALS)
     group.add_argument(
@@ -31,7 +31,7 @@ def _parser() -> cli.Parser:
     gallery = "the first, the middle and the last checkpoint of the run side by side"
     cli.add_flag(parser, "--gallery", gallery)
     cli.add_flag(parser, "--strip", "one image of an untrained, an early and a trained policy")
-    size = "width and height of the video in pixels (default: 1280x720, with --gallery 1280x480)"
+    size = "width and height of the video in pixels (default: 1280x720; 1280x480 with --gallery)"
     parser.add_argument("--size", type=cli.size, metavar="WxH", help=size)
     return parser
 
@@ -65,8 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     _check(parser, options)
-    run, which, episodes = cli.find_policy(options.run), options.which, options.episodes
-    size = options.size
+    run, which, size = cli.find_policy(options.run), options.which, options.size
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import (
             GALLERY_EPISODES,
@@ -76,16 +75,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             render_training_strip,
         )
     cli.prepare_device()
-    with cli.show_progress():
+    with cli.trusting(options.trust), cli.show_progress():
         if options.gallery:
-            rendered = render_gallery(run, episodes=episodes or GALLERY_EPISODES, size=size)
+            rendered = render_gallery(run, episodes=options.episodes or GALLERY_EPISODES, size=size)
         elif options.strip:
             rendered = render_training_strip(run, robots=options.many or 16)
         elif options.many:
             rendered = render_many(run, robots=options.many, which=which, size=size)
         else:
             rendered = render_run(
-                run, episodes=episodes, goals=options.goals, which=which, size=size
+                run, episodes=options.episodes, goals=options.goals, which=which, size=size
             )
     cli.tell(rendered.describe())
     return 0

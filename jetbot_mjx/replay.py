@@ -20,12 +20,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="jetbot-mjx replay", description=__doc__)
     parser.add_argument("file", type=Path, metavar="FILE", help="a file in a run's nan_dumps/")
+    cli.add_trust(parser)
     options = parser.parse_args(arguments)
     with startup.exit_on_interrupt():
         from jetbot_mjx.envs import make_env
         from jetbot_mjx.runs import NAN_DUMP_HEADER, format_step, load_nan_dump, replay_nan_dump
     cli.prepare_device()
-    stored = load_nan_dump(options.file)
+    with cli.trusting(options.trust):
+        stored = load_nan_dump(options.file)
     cli.tell(
         f"the state became non-finite before step {stored.env_steps:,} of the training; the unroll"
         f" up to there:\n{NAN_DUMP_HEADER}"

@@ -35,19 +35,21 @@ def _parser() -> cli.Parser:
     started = f"under srun, mpirun, or with {variables}"
     text = f"this is one of several processes that train one policy, {started}"
     cli.add_flag(parser, "--distributed", text)
+    cli.add_trust(parser)
     return parser
 
 
 def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
     with startup.exit_on_interrupt():
         from jetbot_mjx.runs import default_run_dir, find_run, find_run_config
-    resumed = find_run(options.resume) if options.resume else None
-    if resumed:
-        options.config = find_run_config(resumed)
+    if options.resume:
+        run_dir = find_run(options.resume)
+        options.config = find_run_config(run_dir)
+    else:
+        run_dir = options.run_dir or default_run_dir(options.config)
     given = {"seed": options.seed, "seeds": options.seeds, "init_from": options.init_from}
     overrides = [f"{key}={json.dumps(x)}" for key, x in given.items() if x is not None]
-    config = cli.config_of(options, *overrides)
-    return config, resumed or options.run_dir or default_run_dir(options.config)
+    return cli.config_of(options, *overrides), run_dir
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -66,7 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not (options.resume or options.config):
         parser.error("name a configuration, as in `train jetbot`, or a run to --resume")
     startup.wake_driver()
-    config, run_dir = _config_and_folder(options)
+    with cli.trusting(options.trust):
+        config, run_dir = _config_and_folder(options)
     # Import the large modules while the GPU initialises, and load the programs during the rest.
     with startup.exit_on_interrupt():
         from jetbot_mjx import runs, training
@@ -86,7 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         startup.load_blas()
     with startup.exit_on_interrupt():
         from jetbot_mjx.training import Preemption, run
-    result = run(config, run_dir, programs, Preemption(config.preemption_notice), verbose=True)
+    stop = Preemption(config.preemption_notice)
+    with cli.trusting(options.trust):
+        result = run(config, run_dir, programs, stop, verbose=True)
     if is_primary():
         text = training.closing_message(result)
         runs.log_message(run_dir, text)

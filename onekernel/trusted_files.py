@@ -66,6 +66,9 @@ def write_private(path: Path, content: bytes) -> None:
         written = Path(folder) / path.name
         with open(os.open(written, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
             file.write(hashlib.sha256(content).digest() + content)
+            # A power loss after the rename must not leave the new name without the new content.
+            file.flush()
+            os.fsync(file.fileno())
         written.replace(path)
 
 

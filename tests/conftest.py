@@ -20,6 +20,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" / "tests"))
 # Ours alone whatever the umask, or the commands would not use it.
 Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).mkdir(mode=0o700, parents=True, exist_ok=True)
+# What trainings record of the code that they ran is not the user's either.
+os.environ.setdefault("XDG_STATE_HOME", str(ROOT / ".cache" / "state"))
 # Small programs too: a process of the tests compiles a hundred of them before it begins.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 if os.environ["JAX_PLATFORMS"] == "cpu":
@@ -208,7 +210,9 @@ def small_videos(monkeypatch):
     """Videos have few frames, and small ones, where nobody looks at them."""
     from jetbot_mjx.viewers import gallery, video
 
-    small = functools.partial(video.VideoRenderer, size=(64, 64), fps=2)
+    def small(env, size):
+        return video.VideoRenderer(env, (128, 64), fps=2)
+
     monkeypatch.setattr(gallery, "VideoRenderer", small)
 
 

@@ -103,6 +103,14 @@ def measure(
         "compile_seconds": sum(line["time/compile_seconds"] for line in history),
         "target_reached_seconds": reached[0]["time/wall_seconds"] if reached else None,
         "target_reached_steps": reached[0]["env_steps"] if reached else None,
+        "curve": [
+            {
+                "seconds": line["time/wall_seconds"],
+                "env_steps": line["env_steps"],
+                target.metric: line[f"eval/{target.metric}"],
+            }
+            for line in history
+        ],
         "policy": report["policy"],
         "versions": versions,
         "output": printed.replace(folder, "").splitlines(),
@@ -189,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0 if all(target.is_reached(run["policy"]) for run in runs) else 1
 
 
-def _processor() -> str:
+def processor() -> str:
     """Return the model name of the host's processor."""
     text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     found = re.search(r"^model name\s*: (.*)$", text, re.MULTILINE)
@@ -205,7 +213,7 @@ def _results(
         "metric": target.metric,
         "target": target.value,
         "cpu_cores": os.cpu_count(),
-        "processor": _processor(),
+        "processor": processor(),
         "config": config.model_dump(mode="json"),
         "runs": runs,
     }

@@ -199,7 +199,7 @@ def check(path: str) -> float:
 
 
 def _recorded(path: str) -> tuple:
-    with np.load(path) as recording:
+    with np.load(path, allow_pickle=False) as recording:
         inputs = [recording[name] for name in ABOUT["inputs"]]
         names = ("action", "wheel_speeds") if ABOUT["controller"] else ("action",)
         return inputs, [recording[name] for name in names]

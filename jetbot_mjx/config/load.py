@@ -20,17 +20,18 @@ Overrides = Mapping[str, object] | Sequence[str]
 `section.key=value` as after `--set`."""
 
 
-def load_config(config: "str | Path | Config | None", overrides: Overrides = ()) -> Config:
+def load_config(
+    config: "str | Path | Config | None", overrides: Overrides = (), *, imports: bool = True
+) -> Config:
     """Read a configuration, apply overrides, and check the result.
-
-    The module of `task.name` or `environment` is found beside the file, from now on in the whole
-    process.
 
     Args:
       config: the name of a configuration that comes with the package; a YAML file with the settings
         that differ from the defaults; or a `Config`. None: only defaults.
       overrides: the settings to change, such as `{"ppo.num_envs": 256}`; or a list of
         `section.key=value`, as after `--set`, the value read as YAML, of which the last one wins.
+      imports: whether the module of `task.name` or `environment` is to be found beside the file,
+        from now on in the whole process.
 
     Returns:
       The resolved configuration.
@@ -76,7 +77,7 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
             f"{name}: robot.sha256 = {shown(stored)} is not the hash of the model that was found,"
             f" {resolved.robot.sha256!r}: restore its files, or leave the hash out"
         )
-    if file is not None:
+    if file is not None and imports:
         find_task_beside(file, resolved.code.partition(":")[0])
     return resolved
 

@@ -6,6 +6,7 @@ which has copies of the files, and after the user has changed them.
 """
 
 import hashlib
+import math
 import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,12 @@ FOLDER = "robot"
 
 MAX_BYTES = 20_000_000
 """Largest size of all files of a model together."""
+
+_MOST_ELEMENTS = 10_000
+"""Most elements of a model's file, with those that it repeats: MuJoCo takes seconds for as many."""
+
+_MOST_ATTACHED = 16
+"""Most models that one file attaches, for each may attach others."""
 
 _MODELS: dict[str, Mapping[str, bytes]] = {}
 """Files of each model that this process has read, by their hash."""
@@ -108,6 +115,7 @@ def _collect(
             f"robot.file {path}: <{tree.tag}> is not a MuJoCo model: its root should be <mujoco>"
         )
     _check_numbers(path, tree)
+    _check_size(path, tree)
     trees.append(tree)
     for element in tree.iter():
         if element.tag in ("include", "model") and (name := element.get("file")):
@@ -126,6 +134,30 @@ def _check_numbers(path: Path, tree: ElementTree.Element) -> None:
                 )
 
 
+def _check_size(path: Path, tree: ElementTree.Element) -> None:
+    """Refuse a file of many elements, or a small one that stands for many."""
+    attached = sum(1 for _ in tree.iter("attach"))
+    try:
+        count = _count_elements(tree)
+    except (RecursionError, ValueError):
+        raise ConfigError(
+            f"robot.file {path}: it is nested too deeply, or a count is no whole number"
+        ) from None
+    if count > _MOST_ELEMENTS or attached > _MOST_ATTACHED:
+        raise ConfigError(
+            f"robot.file {path}: it stands for {count:,} elements and attaches {attached} models:"
+            f" at most {_MOST_ELEMENTS:,} and {_MOST_ATTACHED} can be used"
+        )
+
+
+def _count_elements(element: ElementTree.Element) -> int:
+    """Return the number of elements that an element stands for, itself included."""
+    own = 1
+    if element.tag in ("replicate", "composite", "flexcomp"):
+        own = math.prod(max(int(x), 1) for x in element.get("count", "1").split())
+    return own * (1 + sum(map(_count_elements, element)))
+
+
 def _collect_assets(
     trees: Sequence[ElementTree.Element], root: Path, files: dict[str, bytes]
 ) -> None:
@@ -136,6 +168,11 @@ def _collect_assets(
             compiler |= element.attrib
     for element in (one for tree in trees for one in tree.iter()):
         if element.tag not in _FOLDERS:
+            if "file" in element.attrib and element.tag not in ("include", "model"):
+                raise ConfigError(
+                    f"robot.file: <{element.tag} file={shown(element.get('file'))}> names a file"
+                    " that a run cannot store: leave it out"
+                )
             continue
         folder = compiler.get(_FOLDERS[element.tag], compiler.get("assetdir", ""))
         # A cube's texture has a file for each side.

@@ -70,9 +70,16 @@ def find_task_beside(config: Path, module: str) -> None:
 
 def find_task_here(module: str) -> None:
     """Let a task's module be imported from the current folder, unless it was found before."""
-    top, folder = module.partition(".")[0], Path.cwd().resolve()
-    if top not in TASK_FOLDERS and top not in sys.modules and source_file(folder, module):
-        _import_first_from(folder)
+    if is_task_here(module):
+        _import_first_from(Path.cwd().resolve())
+
+
+def is_task_here(module: str) -> bool:
+    """Return whether a task's module is in the current folder, and was not found before."""
+    top = module.partition(".")[0]
+    if top in TASK_FOLDERS or top in sys.modules:
+        return False
+    return source_file(Path.cwd().resolve(), module) is not None
 
 
 def _import_first_from(folder: Path) -> None:

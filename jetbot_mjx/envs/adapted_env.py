@@ -181,10 +181,31 @@ class AdaptedEnv(Env):
           state: a state of this environment.
           action: the action; it is clipped to [-1, 1] unless it is discrete.
         """
+        return self.follow(state, *self.outcome(state, action))
+
+    def outcome(
+        self, state: State, action: Float[Array, " action"]
+    ) -> tuple[dict[str, Array], Outcome]:
+        """Return what the environment itself makes of a step: what is kept, by name, and the rest.
+
+        Args:
+          state: a state of this environment.
+          action: as of `step`.
+        """
         before: PyTree = state.pipeline_state
         given = action if self.is_discrete else jnp.clip(action, -1.0, 1.0)
         arguments = [before.kept[name] for name in self._names]
-        kept, shown = self._divided(self._step_traced(*arguments, given))
+        return self._divided(self._step_traced(*arguments, given))
+
+    def follow(self, state: State, kept: dict[str, Array], shown: Outcome) -> State:
+        """Return the state after a step.
+
+        Args:
+          state: the state before it.
+          kept: what is kept, of `outcome`.
+          shown: the rest of it.
+        """
+        before: PyTree = state.pipeline_state
         metrics, succeeded = dict(shown.metrics), before.succeeded
         if self.has_success:
             # An environment may tell it in every step from then on.

@@ -190,7 +190,7 @@ def _read_ranges(path: str | Path | None) -> RandomizationConfig | None:
     """Read the ranges of `--ranges`, which replace those of every run."""
     if path is None:
         return None
-    ranges = load_config(path).randomization
+    ranges = load_config(path, imports=False).randomization
     if not ranges.drawn:
         raise UserError(
             f"--ranges {path}: it randomizes nothing; give a configuration with ranges below"

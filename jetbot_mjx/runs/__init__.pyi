@@ -65,11 +65,15 @@ from .run_finder import find_run_config as find_run_config
 from .setup import Setup as Setup
 from .task_code import TaskCode as TaskCode
 from .task_code import collect_task_code as collect_task_code
-from .task_code import read_task_code as read_task_code
 from .task_code import stored_class as stored_class
 from .task_code import write_task_code as write_task_code
 from .train_log import TRAIN_LOG as TRAIN_LOG
 from .train_log import log_message as log_message
+from .trust import check_links as check_links
+from .trust import record_code as record_code
+from .trust import require_trust as require_trust
+from .trust import trusted_class as trusted_class
+from .trust import trusting as trusting
 from .wandb_sink import WandbSink as WandbSink
 from .wandb_sink import check_tracking as check_tracking
 from .warm_start import WarmStart as WarmStart

@@ -22,7 +22,7 @@ from jetbot_mjx.runs.run_dir import JsonObject, parse_stored
 from jetbot_mjx.runs.run_finder import PRETRAINED as PRETRAINED
 from jetbot_mjx.runs.run_finder import ROOT, explain_missing, find_run, scan_runs, suggest_run
 from jetbot_mjx.runs.setup import Setup
-from jetbot_mjx.runs.task_code import stored_class
+from jetbot_mjx.runs.trust import trusted_class
 
 Which = Literal["best", "last"] | int
 """Selects a checkpoint of a run: the best, the last, or one by its environment steps."""
@@ -94,10 +94,11 @@ class Checkpoint(NamedTuple):
         imported by name or has changed.
 
         Raises:
-          UserError: it cannot be built, or its stored code is damaged.
+          UserError: it cannot be built, its stored code is damaged, or it names code that may not
+            run, as for `require_trust`.
           CheckpointError: its observation differs from the one that the policy was trained on.
         """
-        own_class = stored_class(self.run_dir, self.config.code)
+        own_class = trusted_class(self.run_dir, self.config)
         config = self.config.for_any_device()
         setup = Setup(config, own_class=own_class, networks=self.networks)
         layout = layout_data(setup.env.layout)

@@ -1,5 +1,6 @@
 """Write checkpoints with Orbax, which takes a third of a second to import."""
 
+import asyncio
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -7,7 +8,9 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers
+from orbax.checkpoint.path import atomicity
 
+from jetbot_mjx.runs.durable import sync, sync_tree
 from jetbot_mjx.runs.run_dir import JsonObject
 
 
@@ -37,6 +40,7 @@ def open_manager(
         step_name_format=ocp.path.step.standard_name_format(step_format_fixed_length=step_digits),
         preservation_policy=_PreserveBestAndLatest(keep, success),
         cleanup_tmp_directories=True,
+        temporary_path_class=_SyncedTemporaryPath,
         todelete_subdir=deleted,
     )
     return ocp.CheckpointManager(folder, options=options)
@@ -62,6 +66,19 @@ def start_save(
     arrays = {name: ocp.args.StandardSave(tree) for name, tree in trees.items()}
     values = {name: ocp.args.JsonSave(value) for name, value in objects.items()}
     return manager.save(env_steps, args=ocp.args.Composite(**arrays, **values))
+
+
+class _SyncedTemporaryPath(atomicity.AtomicRenameTemporaryPath):
+    """A temporary path of Orbax that gets its final name after the disk holds its content."""
+
+    async def finalize(self) -> None:
+        """Sync the content, rename, and sync the name.
+
+        Orbax also writes two small files here, which no reader of this project reads.
+        """
+        await asyncio.to_thread(sync_tree, Path(self.get()))
+        await super().finalize()
+        await asyncio.to_thread(sync, Path(self.get_final().parent))
 
 
 class _PreserveBestAndLatest(checkpoint_managers.PreservationPolicy):

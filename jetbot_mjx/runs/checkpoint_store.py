@@ -6,9 +6,9 @@ checkpoint, and a damaged checkpoint must never be loaded as if it were a good o
 
 Protocol:
 
-1. Write: Orbax writes each checkpoint under a temporary name and renames it to
-   `checkpoints/<env_steps>/` when it is complete. A process that dies leaves at most a temporary
-   folder, which the next one removes.
+1. Write: Orbax writes each checkpoint under a temporary name, has the disk hold all of it, and
+   renames it to `checkpoints/<env_steps>/`. A process that dies leaves at most a temporary folder,
+   which the next one removes, and so does a loss of power.
 2. Digests: the folder holds one or more trees of arrays and `about`, a JSON object. `about` also
    holds the SHA-256 of each tree and of itself. Of a joined tree, Orbax writes the bytes of all
    arrays as one, and `about` holds their names, dtypes and shapes: an array by itself takes Orbax a
@@ -46,6 +46,7 @@ import tensorstore as ts
 from jaxtyping import PyTree
 
 from jetbot_mjx.errors import NotFoundError, UserError, clipped, os_errors, shown
+from jetbot_mjx.runs.durable import make_folders, move
 from jetbot_mjx.runs.run_dir import JsonObject, read_text, remove
 
 if TYPE_CHECKING:
@@ -101,16 +102,14 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
           run_dir: the run folder, which must exist.
           keep: the number of latest checkpoints to keep, besides the first and the best.
         """
-        self._scores = {
-            step: stored_score(run_dir, step) for step in checkpoint_steps(run_dir)
-        }
+        self._scores = {step: stored_score(run_dir, step) for step in checkpoint_steps(run_dir)}
         self._keep = keep
-        self._manager: "ocp.CheckpointManager | None" = None
+        self._manager: ocp.CheckpointManager | None = None
         self._log = contextlib.ExitStack()
         self._folder = (run_dir / FOLDER).absolute()
         self._clear_deleted()
         with self._writing():
-            self._folder.mkdir(exist_ok=True)
+            make_folders(self._folder)
 
     def save(
         self,
@@ -253,9 +252,11 @@ def set_aside(path: Path) -> Path:
     """
     folder = path.parent.parent / "set_aside"
     with os_errors(f"checkpoint {path} cannot be moved into {folder}", CheckpointError):
-        folder.mkdir(exist_ok=True)
+        make_folders(folder)
         numbers = (folder / f"{path.name}.{number}" for number in itertools.count())
-        return path.rename(next(free for free in numbers if not os.path.lexists(free)))
+        free = next(free for free in numbers if not os.path.lexists(free))
+        move(path, free)
+        return free
 
 
 def read_about(path: Path, required: Sequence[str] = ()) -> JsonObject:

@@ -6,8 +6,9 @@ timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.p
   eval/success_rate         success rate; interval: success_low, success_high
   eval/time_to_goal_median  [s] median time of the successes; 95th percentile: time_to_goal_p95
   eval/path_efficiency      straight line over distance travelled, mean over the successes
-  eval/episode_return       [m] mean sum of rewards, about the distance covered; of an `environment`
-                            in its own unit, with return_low, return_high, return_min, episode_length
+  eval/episode_return       [m] mean sum of rewards, about the distance covered; of an
+                            `environment` in its own unit, with return_low, return_high,
+                            return_min, episode_length
   eval/final_distance_median  [m] distance to the goal at the end, on the floor
   eval/nonfinite_envs       episodes that were cut off because of a non-finite state
   loss/total, policy, value, entropy  means over the interval, as Brax computes them
@@ -227,7 +228,8 @@ class TensorBoardSink:
     """A sink that writes TensorBoard event files without TensorFlow.
 
     With a configuration, the file also holds its YAML as text, its settings as hyperparameters
-    beside the last success rate or return, and charts with that first. Videos are GIFs among the images.
+    beside the last success rate or return, and charts with that first. Videos are GIFs among the
+    images.
     """
 
     def __init__(

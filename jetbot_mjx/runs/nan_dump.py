@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -11,20 +12,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jetbot_mjx import envs
 from jetbot_mjx.agents import NanDump
 from jetbot_mjx.config import Config, ConfigError
-from jetbot_mjx import envs
 from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, PhysicsState, State
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import flatten
+from jetbot_mjx.runs.durable import make_folders
 from jetbot_mjx.runs.run_dir import parse_stored, read_bytes, write_bytes
-from jetbot_mjx.runs.task_code import stored_class
+from jetbot_mjx.runs.trust import trusted_class
 
 FOLDER = "nan_dumps"
 """Name of the folder of dumps in a run folder."""
 
 MAX_DUMPS = 20
 """Largest number of dumps that a run saves; further ones would add no information."""
+
+_MOST_BYTES = 100_000_000
+"""Largest size of the arrays of a dump, which a compressed file of any size could ask for."""
 
 _FORMAT = "jetbot_mjx.nan_dump/1"
 
@@ -62,7 +67,7 @@ def save_nan_dump(run_dir: Path, config: Config, env_steps: int, nan_dump: NanDu
       OSError: the file cannot be written.
     """
     folder = run_dir / FOLDER
-    folder.mkdir(exist_ok=True)
+    make_folders(folder)
     path = folder / f"{env_steps:012d}.npz"
     if len(list(folder.glob("*.npz"))) >= MAX_DUMPS and not path.exists():
         return None
@@ -85,16 +90,20 @@ def load_nan_dump(path: Path) -> StoredNanDump:
     Raises:
       NotFoundError: there is no such file.
       InvalidError: `save_nan_dump` did not write it.
+      UserError: its run names code that may not run, as for `require_trust`.
     """
     try:
-        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as stored:
+        content = io.BytesIO(read_bytes(path))
+        if sum(one.file_size for one in zipfile.ZipFile(content).infolist()) > _MOST_BYTES:
+            raise InvalidError(f"{path} holds more than {_MOST_BYTES // 1_000_000} MB")
+        with np.load(content, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         about = json.loads(str(arrays.pop("about")))
         if about["format"] != _FORMAT:
             raise InvalidError(f"{path} has the format {shown(about['format'])}, not {_FORMAT!r}")
         run_dir = Path(path).absolute().parent.parent
         config = parse_stored(about["config"], run_dir, "stored config")
-        own_class = stored_class(run_dir, config.code)
+        own_class = trusted_class(run_dir, config)
         template = _template(config, own_class)
         wanted = flatten(template)
         if wanted.keys() != arrays.keys():
@@ -126,7 +135,9 @@ def load_nan_dump(path: Path) -> StoredNanDump:
 
 def _template(config: Config, own_class: type | None) -> NanDump:
     """Return the shapes and dtypes of a dump of this configuration."""
-    env = envs.wrap_for_training(envs.make_env(config, own_class=own_class), config.task.episode_length)
+    env = envs.wrap_for_training(
+        envs.make_env(config, own_class=own_class), config.task.episode_length
+    )
     batched = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((1, 2), np.uint32))
     state: State = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batched)
     return NanDump(
@@ -147,9 +158,7 @@ class ReplayStep(NamedTuple):
     """Names of the arrays that are not finite."""
 
 
-def replay_nan_dump(
-    stored: StoredNanDump, env: JetBotEnv | AdaptedEnv
-) -> Iterator[ReplayStep]:
+def replay_nan_dump(stored: StoredNanDump, env: JetBotEnv | AdaptedEnv) -> Iterator[ReplayStep]:
     """Replay the recorded actions from the state in which the unroll began.
 
     Args:

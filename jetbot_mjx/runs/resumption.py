@@ -15,8 +15,8 @@ from jaxtyping import PyTree
 
 from jetbot_mjx.agents import TALLIED, PolicyParams, TrainState
 from jetbot_mjx.config import Config, ConfigError, parse_config
-from jetbot_mjx.runs.checkpoint import POLICY, explanation
 from jetbot_mjx.runs import checkpoint_store
+from jetbot_mjx.runs.checkpoint import POLICY, explanation
 from jetbot_mjx.runs.checkpoint_store import CheckpointError, checkpoint_path
 from jetbot_mjx.runs.run_dir import JsonObject
 
@@ -62,7 +62,9 @@ def resume(
       CheckpointError: there are checkpoints, but none of them can be used. No file is changed.
     """
     # Try the steps from the newest to the oldest, until all seeds can be read at one of them.
-    known = sorted({step for run_dir in run_dirs for step in checkpoint_store.checkpoint_steps(run_dir)})
+    known = sorted(
+        {step for run_dir in run_dirs for step in checkpoint_store.checkpoint_steps(run_dir)}
+    )
     skipped: list[str] = []
     for step in reversed(known):
         try:
@@ -83,8 +85,8 @@ def resume(
     if not known:
         return None
     raise CheckpointError(
-        f"no checkpoint in {run_dirs[0] / checkpoint_store.FOLDER} can be used. The newest: {skipped[0]}."
-        " Train into a new folder"
+        f"no checkpoint in {run_dirs[0] / checkpoint_store.FOLDER} can be used. The newest:"
+        f" {skipped[0]}. Train into a new folder"
     )
 
 

@@ -32,7 +32,8 @@ from jetbot_mjx.config import (
     register,
 )
 from jetbot_mjx.envs import LIBRARIES, installed_version
-from jetbot_mjx.errors import UserError, clipped, os_errors
+from jetbot_mjx.errors import UserError, clipped, os_errors, shown
+from jetbot_mjx.runs.durable import exchange, make_folders, move, sync_tree
 
 try:
     import fcntl
@@ -134,9 +135,13 @@ def parse_stored(values: Mapping[str, object], run_dir: Path, source: str) -> Co
       source: description of their origin for error messages.
 
     Raises:
-      ConfigError: the settings are damaged.
+      ConfigError: the settings are damaged, or name a robot outside of the run.
       DamagedRunError: the model's files are not those that the training stored.
     """
+    robot = values.get("robot")
+    name = robot.get("file") if isinstance(robot, Mapping) else None
+    if isinstance(name, str) and name != Path(name).name:
+        raise ConfigError(f"{source}: robot.file = {shown(name)}: a run stores no path, but a name")
     config = parse_config(values, source)
     if isinstance(config.robot, MjcfRobotConfig):
         _read_model(run_dir, config.robot)
@@ -178,7 +183,7 @@ def occupied(run_dir: Path) -> Iterator[None]:
     """
     path = run_dir / ".lock"
     try:
-        run_dir.mkdir(parents=True, exist_ok=True)
+        make_folders(run_dir)
         file = path.open("a+")
     except OSError as error:
         reason = error.strerror or f"{path.name} is not a regular file"
@@ -234,7 +239,7 @@ def write_model(folder: Path, config: Config) -> None:
         return
     for name, content in (model_files(config.robot.sha256) or {}).items():
         file = folder / FOLDER / name
-        file.parent.mkdir(parents=True, exist_ok=True)
+        make_folders(file.parent)
         write_bytes(file, content)
 
 
@@ -294,7 +299,7 @@ def check_writable(path: Path) -> None:
 
 @contextlib.contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder, and put it in the place of `folder` when it is complete.
+    """Yield a temporary folder, and put it in the place of `folder` when the disk holds it.
 
     Raises:
       UserError: the folder cannot be written.
@@ -304,12 +309,16 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     with writing_to(folder):
         remove(unfinished)
         remove(earlier)
-        unfinished.mkdir(parents=True)
+        make_folders(folder.parent)
+        unfinished.mkdir()
         try:
             yield unfinished
-            if folder.exists():
+            sync_tree(unfinished)
+            if not folder.exists():
+                move(unfinished, folder)
+            elif not exchange(unfinished, folder):
                 folder.rename(earlier)
-            unfinished.rename(folder)
+                move(unfinished, folder)
         finally:
             remove(unfinished)
             remove(earlier)
@@ -332,7 +341,7 @@ def make_folder(path: Path) -> None:
       UserError: the folder cannot be created.
     """
     with writing_to(path):
-        path.mkdir(parents=True, exist_ok=True)
+        make_folders(path)
 
 
 def shortened(path: Path) -> Path:
@@ -395,22 +404,26 @@ def write_json(path: Path, values: object) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically: it is complete or unchanged whenever the process ends."""
+    """Write a text file atomically, as `write_bytes` does."""
     write_bytes(path, text.encode())
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically: it is complete or unchanged whenever the process ends.
+    """Write a file atomically: it is complete or unchanged whenever process or power end.
 
-    Others may write the same file at the same time: the last one to complete it stays.
+    After the call the disk holds it. Others may write the same file at the same time: the last one
+    to complete it stays.
     """
     writer = f"{os.getpid()}-{threading.get_ident()}"
     unfinished = path.with_name(f".{path.name}.{writer}.unfinished")
     # A named pipe in its place would wait for a reader.
     unfinished.unlink(missing_ok=True)
     try:
-        unfinished.write_bytes(content)
-        unfinished.replace(path)
+        with unfinished.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        move(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
 

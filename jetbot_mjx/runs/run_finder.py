@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from jetbot_mjx.config import run_around
+from jetbot_mjx.config import Config, run_around
 from jetbot_mjx.errors import NotFoundError, UserError, clipped, os_errors, printable
 from jetbot_mjx.runs.metrics import METRICS, read_history
 from jetbot_mjx.runs.run_dir import (
@@ -24,6 +24,7 @@ from jetbot_mjx.runs.run_dir import (
     read_config,
     shortened,
 )
+from jetbot_mjx.runs.trust import require_trust
 from jetbot_mjx.terminal import text_table
 
 ROOT = Path("runs")
@@ -102,13 +103,13 @@ def find_run(name: str | Path, root: Path = ROOT) -> Path:
     return Path(name)
 
 
-def find_run_config(run_dir: Path) -> Path:
-    """Return the file that holds the configuration of the run in a folder.
+def find_run_config(run_dir: Path) -> Config:
+    """Return the configuration of the run in a folder, which is to be continued.
 
     Raises:
       NotFoundError: there is no run in the folder.
       DamagedRunError: as for `read_config`.
-      UserError: the folder cannot be read.
+      UserError: the folder cannot be read; or as for `require_trust`.
     """
     with os_errors(f"--resume {run_dir} cannot be read"):
         try:
@@ -117,12 +118,13 @@ def find_run_config(run_dir: Path) -> Path:
             hint = suggest_run(run_dir, "a run folder")
             message = f"--resume {run_dir}: there is no run in this folder; {hint}"
             raise NotFoundError(message) from None
-    read_config(run_dir)
-    return run_dir / CONFIG
+    config = read_config(run_dir)
+    require_trust(run_dir, config)
+    return config
 
 
 def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[DamagedRunError]]:
-    """Return the runs in the subfolders of a folder, the latest first, and the errors of the others.
+    """Return the runs in the subfolders of a folder, the latest first, and the others' errors.
 
     Args:
       root: the folder, which may be missing.

@@ -1,31 +1,42 @@
 """Store the source of one's own task or environment in the run folder, and import it from there.
 
 A policy is worth little without what it was trained in. When a training begins, the file of the
-module of task or environment and those of the modules that it imports from the same folder are copied to
-`task/` in the run folder, each with its SHA-256. Later commands import the stored files if the
-module cannot be found, or if its files differ from the stored ones. Tasks of this package and of
-installed packages are not stored, because their versions are.
+module of task or environment and those of the modules that it imports from the same folder are
+copied to `task/` in the run folder, each with its SHA-256. Later commands import the stored files
+if the module cannot be found, or if its files differ from the stored ones. Tasks of this package
+and of installed packages are not stored, because their versions are.
 
-For the time of the import, the stored folder comes first in `sys.path`; afterwards its modules
-leave `sys.modules`, so that runs with different sources of one name can be used in one process. So
-the modules must import each other when they are imported, not later in a function.
+The stored files are imported from memory, as they were checked: no other file in the run folder,
+and no bytecode, is ever imported. Afterwards their modules leave `sys.modules`, so that runs with
+different sources of one name can be used in one process. So the modules must import each other when
+they are imported, not later in a function.
 """
 
 import ast
 import contextlib
 import hashlib
 import importlib
+import importlib.abc
 import importlib.util
 import json
+import os
 import sys
 import threading
 from collections.abc import Iterable, Iterator
+from importlib.machinery import ModuleSpec
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 from typing import NamedTuple
 
-from jetbot_mjx.config import find_task_here, import_root, shipped_folder, source_file
+from jetbot_mjx.config import (
+    find_task_here,
+    import_root,
+    is_task_here,
+    shipped_folder,
+    source_file,
+)
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.durable import make_folders
 from jetbot_mjx.runs.run_dir import (
     read_bytes,
     read_text,
@@ -97,7 +108,9 @@ def collect_task_code(name: str) -> TaskCode | None:
     if source_file(root, module) is None:
         return None
     if sum(map(len, files.values())) > MAX_BYTES:
-        _say(f"the source of {name} is larger than {MAX_BYTES:,} bytes and is not stored in the run")
+        _say(
+            f"the source of {name} is larger than {MAX_BYTES:,} bytes and is not stored in the run"
+        )
         return None
     if late:
         _say(
@@ -121,7 +134,7 @@ def write_task_code(run_dir: Path, code: TaskCode) -> None:
     folder = run_dir / FOLDER
     with writing_to(folder):
         for path, content in code.files:
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            make_folders((folder / path).parent)
             write_bytes(folder / path, content)
         hashes = {path: hashlib.sha256(content).hexdigest() for path, content in code.files}
         # Write this file last: without it, the others count as not stored.
@@ -166,7 +179,7 @@ def read_task_code(run_dir: Path) -> TaskCode | None:
     return TaskCode(module, tuple(sorted(files)))
 
 
-def stored_class(run_dir: Path, name: str, *, silent: bool = False) -> type | None:
+def stored_class(run_dir: Path, name: str, code: TaskCode, *, silent: bool = False) -> type | None:
     """Import the class of a task or an environment from the source that its run stored.
 
     A line on stderr says so, once for each source, unless `silent`.
@@ -174,32 +187,38 @@ def stored_class(run_dir: Path, name: str, *, silent: bool = False) -> type | No
     Args:
       run_dir: the run folder.
       name: the class as `package.module:Class`.
+      code: the source.
       silent: whether to print nothing.
 
     Returns:
-      The class. None if the module is to be imported by its name: the run stored no source of it,
-      or the module's own files are those that were stored.
+      The class. None if the module is to be imported by its name: the source is that of another
+      one, or the files of the module that Python finds are those that were stored.
 
     Raises:
-      UserError: the stored source is damaged, or cannot be imported.
+      UserError: the stored source cannot be imported.
     """
     module, _, class_name = name.partition(":")
-    code = read_task_code(run_dir)
     # Never replace this package, whose compiled programs are cached by its own source.
-    if code is None or code.module != module or module.partition(".")[0] == _PACKAGE:
+    if code.module != module or module.partition(".")[0] == _PACKAGE:
         return None
-    # Prefer the module itself if nothing changed, so that its classes are the user's own.
-    find_task_here(module)
-    root = import_root(module)
-    on_disk = root is not None and source_file(root, module) is not None
-    if root is not None and on_disk and all(_holds(root / path, text) for path, text in code.files):
+    # Prefer the module itself if nothing changed, so that its classes are the user's own. But in
+    # the current folder, which may be anyone's, there could be other files that it would import.
+    is_here = is_task_here(module)
+    place = Path.cwd() if is_here else import_root(module)
+    on_disk = place is not None and source_file(place, module) is not None
+    is_same = (
+        place is not None
+        and on_disk
+        and all(holds(place / path, text) for path, text in code.files)
+    )
+    if is_same and not is_here:
         return None
     # Import the stored files.
     folder = shortened(run_dir / FOLDER)
     main = source_file(run_dir / FOLDER, module)
     if main is None:
         raise UserError(f"{folder} holds no source of {module}: delete it to run {module} itself")
-    if silent:
+    if silent or is_same:
         pass
     elif on_disk:
         reason = f"{module} on disk differs from the code this run was trained with: using the"
@@ -258,7 +277,8 @@ def _imports(source: bytes, package: str) -> list[tuple[str, int, bool]]:
     return found
 
 
-def _holds(path: Path, content: bytes) -> bool:
+def holds(path: Path, content: bytes) -> bool:
+    """Return whether a file exists and has this content."""
     try:
         return path.read_bytes() == content
     except OSError:
@@ -286,26 +306,58 @@ def _import_stored(folder: Path, code: TaskCode) -> ModuleType:
     with _lock:
         if code not in _modules:
             names = {path.partition("/")[0].removesuffix(".py") for path, _ in code.files}
-            with _importing_from(folder, names):
+            with _importing_from(folder, code, names):
                 _modules[code] = importlib.import_module(code.module)
         return _modules[code]
 
 
-@contextlib.contextmanager
-def _importing_from(folder: Path, names: Iterable[str]) -> Iterator[None]:
-    """Import top-level modules of the given names from a folder, and no other ones.
+class _Importer(importlib.abc.MetaPathFinder, importlib.abc.SourceLoader):
+    """An `_Importer` imports modules from the files of a source in memory."""
 
-    Other modules of these names return to `sys.modules` afterwards.
+    def __init__(self, folder: Path, code: TaskCode) -> None:
+        self._folder = folder
+        self._files = {str(folder / path): content for path, content in code.files}
+
+    def find_spec(self, fullname: str, *_: object) -> ModuleSpec | None:
+        folder = str(self._folder.joinpath(*fullname.split(".")))
+        spec = None
+        if self._file(fullname) is not None:
+            spec = importlib.util.spec_from_loader(fullname, self)
+        elif any(file.startswith(f"{folder}{os.sep}") for file in self._files):
+            spec = ModuleSpec(fullname, None, is_package=True)
+        if spec is not None and spec.submodule_search_locations is not None:
+            # Nothing else is found in the folder of a package.
+            spec.submodule_search_locations = []
+        return spec
+
+    def get_filename(self, fullname: str) -> str:
+        file = self._file(fullname)
+        assert file is not None
+        return file
+
+    def get_data(self, path: str) -> bytes:
+        if path not in self._files:
+            raise FileNotFoundError(path)
+        return self._files[path]
+
+    def _file(self, fullname: str) -> str | None:
+        path = self._folder.joinpath(*fullname.split("."))
+        candidates = str(path / "__init__.py"), f"{path}.py"
+        return next((file for file in candidates if file in self._files), None)
+
+
+@contextlib.contextmanager
+def _importing_from(folder: Path, code: TaskCode, names: Iterable[str]) -> Iterator[None]:
+    """Import modules of a source from memory.
+
+    Other modules of these top-level names return to `sys.modules` afterwards.
     """
-    others, writes_no_bytecode = _pop_modules(names), sys.dont_write_bytecode
-    sys.path.insert(0, str(folder))
-    sys.dont_write_bytecode = True
-    importlib.invalidate_caches()
+    others, importer = _pop_modules(names), _Importer(folder, code)
+    sys.meta_path.insert(0, importer)
     try:
         yield
     finally:
-        sys.path.remove(str(folder))
-        sys.dont_write_bytecode = writes_no_bytecode
+        sys.meta_path.remove(importer)
         _pop_modules(names)
         sys.modules.update(others)
 

@@ -11,10 +11,10 @@ observation's layout names those numbers, so that the rows can be matched betwee
 All later layers are taken over but for the policy's last one. A trained policy commands full speed
 almost everywhere, and there its noise changes nothing that it could learn from. Therefore the last
 layer's means are scaled by `MEAN_SCALE`, which changes how hard the policy steers and not where to,
-and the part that gives the width of its noise is that of a new policy. The optimizer starts from its initial state.
+and the part that gives the width of its noise is that of a new policy. The
+optimizer starts from its initial state.
 """
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +27,6 @@ from jetbot_mjx.config import Config
 from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, LayoutData, State, layout_data
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Checkpoint
-from jetbot_mjx.runs.run_dir import JsonObject
 from jetbot_mjx.runs.setup import Setup
 
 MEAN_SCALE = 0.25

@@ -194,7 +194,7 @@ def _compose(
 ) -> Training:
     """Build every object of a training once."""
     run_dirs = runs.seed_dirs(run_dir, config)
-    own_class, task_code = _find_code(config.code, run_dirs)
+    own_class, task_code = _find_code(config, run_dirs)
     setup = Setup(config, programs, own_class=own_class)
     if isinstance(setup.env, AdaptedEnv):
         _check_targets(config, setup.env)
@@ -204,7 +204,7 @@ def _compose(
         # Only now it is known what the programs depend on.
         setup.programs = envs.open_program_cache(config, own=envs.own_fingerprint(setup.env))
     if isinstance(setup.env, AdaptedEnv) and not setup.programs.has("advance"):
-        # It costs about a second, and what was trained before has passed it.
+        # What was trained before has passed it.
         envs.require_sound(setup.env)
     hints = [] if isinstance(setup.env, AdaptedEnv) else envs.training_hints(setup.env)
     ppo = ppo_trainer.build_ppo(setup)
@@ -247,7 +247,7 @@ def _check_targets(config: Config, env: AdaptedEnv) -> None:
         )
 
 
-def _find_code(name: str, run_dirs: Sequence[Path]) -> tuple[type | None, TaskCode | None]:
+def _find_code(config: Config, run_dirs: Sequence[Path]) -> tuple[type | None, TaskCode | None]:
     """Return the class of the task or the environment if the run stores it, or its source to store.
 
     A run that has checkpoints continues with the code that it was begun with. Of several processes,
@@ -257,19 +257,22 @@ def _find_code(name: str, run_dirs: Sequence[Path]) -> tuple[type | None, TaskCo
     resumes = primary and _has_checkpoints(run_dirs)
 
     def source() -> TaskCode | None:
-        return runs.read_task_code(run_dirs[0]) if resumes else runs.collect_task_code(name)
+        if resumes:
+            return runs.require_trust(run_dirs[0], config)
+        return runs.collect_task_code(config.code)
 
     sent = distributed.broadcast_from_primary(source) if jax.process_count() > 1 else None
-    own_class = runs.stored_class(run_dirs[0], name) if resumes else None
+    own_class = runs.trusted_class(run_dirs[0], config) if resumes else None
     if sent and not primary:
         with tempfile.TemporaryDirectory() as folder:
             runs.write_task_code(Path(folder), sent)
-            own_class = runs.stored_class(Path(folder), name, silent=True)
-    return own_class, None if own_class else runs.collect_task_code(name)
+            own_class = runs.stored_class(Path(folder), config.code, sent, silent=True)
+    return own_class, None if own_class else runs.collect_task_code(config.code)
 
 
 def _store_run(training: Training) -> None:
     """Write what is known before training: configuration, versions and the source of the task."""
+    runs.record_code(training.run_dir, training.config, training.task_code)
     folders = {training.run_dir: training.config}
     if training.config.seeds > 1:
         folders |= dict(zip(training.run_dirs, training.config.of_each_seed(), strict=True))
@@ -285,6 +288,7 @@ def _train_with_brax(training: Training) -> Result:
     from jetbot_mjx.training import brax_trainer
 
     _check_folder(training)
+    runs.check_links(training.run_dir)
     with runs.occupied(training.run_dir), CompileClock() as clock:
         _store_run(training)
         with open_recorder(training, clock, None) as recorder:
@@ -476,6 +480,7 @@ def _open_folders(
     """
     run_dir, run_dirs = training.run_dir, training.run_dirs
     holds_run = _check_folder(training)
+    runs.check_links(run_dir)
     for folder in dict.fromkeys([run_dir, *run_dirs]):
         stack.enter_context(runs.occupied(folder))
     resumption = runs.resume(run_dirs, training.config.of_each_seed(), template)

@@ -12,12 +12,13 @@ has not used, and evaluated on the report's goals, which chose nothing.
 
 import contextlib
 import functools
+import sqlite3
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -97,6 +98,18 @@ def quiet() -> Iterator[None]:
         optuna.logging.set_verbosity(verbosity)
 
 
+class _SyncedConnection(sqlite3.Connection):
+    """A connection whose commits the disk holds: SQLite also syncs the end of its journal.
+
+    By default a loss of power just after a commit may bring the journal back, and undo the commit.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Open the database."""
+        super().__init__(*args, **kwargs)
+        self.execute("PRAGMA synchronous = EXTRA")
+
+
 class Search:
     """A `Search` runs trials of one study."""
 
@@ -158,7 +171,7 @@ class Search:
     def _open(self) -> optuna.storages.RDBStorage:
         """Return the database, whose tables only one of several workers can create."""
         sqlite = {
-            "connect_args": {"timeout": _LOCKED_SECONDS},
+            "connect_args": {"timeout": _LOCKED_SECONDS, "factory": _SyncedConnection},
             # Whoever holds the study may use it at any time, and nobody closes it: so that no
             # connection stays open, each is closed when it has been used.
             "poolclass": sqlalchemy.NullPool,

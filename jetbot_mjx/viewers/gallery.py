@@ -300,17 +300,34 @@ def _write_videos(files: Mapping[str, Path], videos: Sequence[Iterable[Frame]], 
       videos: The frames of each video.
       total: The number of frames of all videos.
     """
+    frames = write_video(files["video"], videos, total, _GIF_WIDTH)
+    with stage("writing the gif"), runs.writing_to(files["gif"]):
+        write_gif(files["gif"], frames)
+
+
+def write_video(
+    path: Path, videos: Sequence[Iterable[Frame]], total: int, gif_width: int
+) -> list[Frame]:
+    """Write videos one after the other to an mp4 file, and return the frames of its gif.
+
+    Args:
+      path: The path of the file.
+      videos: The frames of each video.
+      total: The number of frames of all videos.
+      gif_width: The largest width of the gif [pixels].
+
+    Returns:
+      Frames of the first `_GIF_EPISODES` videos.
+    """
     shown: list[list[Frame]] = [[] for _ in videos]
 
     def watched(video: Iterable[Frame], small: list[Frame], advance: Advance) -> Iterator[Frame]:
         for index, frame in enumerate(video):
             if index % GIF_STRIDE == 0:
-                small.append(resize_frame(frame, min(1.0, _GIF_WIDTH / frame.shape[1])))
+                small.append(resize_frame(frame, min(1.0, gif_width / frame.shape[1])))
             yield frame
             advance(1)
 
-    with stage("frames", total) as advance, runs.writing_to(files["video"]):
-        frames = (watched(*one, advance) for one in zip(videos, shown, strict=True))
-        write_mp4(files["video"], join(frames))
-    with stage("writing the gif"), runs.writing_to(files["gif"]):
-        write_gif(files["gif"], list(join(shown[:_GIF_EPISODES], FADE_FRAMES // GIF_STRIDE)))
+    with stage("frames", total) as advance, runs.writing_to(path):
+        write_mp4(path, join(watched(*one, advance) for one in zip(videos, shown, strict=True)))
+    return list(join(shown[:_GIF_EPISODES], FADE_FRAMES // GIF_STRIDE))

@@ -12,20 +12,24 @@ from PIL import Image, ImageDraw, ImageFont
 
 from jetbot_mjx import runs
 from jetbot_mjx.errors import UserError, check_count
-from jetbot_mjx.viewers.gallery import Rendered, run_episodes, run_folder, video_files
+from jetbot_mjx.terminal import stage
+from jetbot_mjx.viewers.gallery import (
+    Rendered,
+    run_episodes,
+    run_folder,
+    video_files,
+    write_video,
+)
 from jetbot_mjx.viewers.grid_renderer import GridRenderer, camera_above, pull_back_camera
 from jetbot_mjx.viewers.robot_grid import RobotGrid, place_on_grid
 from jetbot_mjx.viewers.video import (
     FPS,
-    GIF_STRIDE,
     REACHED,
     SIZE,
     Frame,
-    join,
     resize_frame,
     with_lines,
     write_gif,
-    write_mp4,
 )
 
 MOST_ROBOTS = 1024
@@ -83,13 +87,12 @@ def render_many(
     # Render the frames, and write the animation in the largest size that fits.
     width, height = size or SIZE
     with GridRenderer(env, robots, width, height) as renderer:
-        frames = list(join([_video_frames(grid, renderer, width / height)]))
-    with runs.writing_to(files["video"]):
-        write_mp4(files["video"], frames)
-    with runs.writing_to(files["gif"]):
+        video = _video_frames(grid, renderer, width / height)
+        frames = write_video(files["video"], [video], _frame_count(grid), _GIF_WIDTHS[0])
+    with stage("writing the gif"), runs.writing_to(files["gif"]):
         for gif_width in _GIF_WIDTHS:
-            scale = min(1.0, gif_width / width)
-            write_gif(files["gif"], [resize_frame(frame, scale) for frame in frames[::GIF_STRIDE]])
+            scale = min(1.0, gif_width / frames[0].shape[1])
+            write_gif(files["gif"], [resize_frame(frame, scale) for frame in frames])
             if files["gif"].stat().st_size <= MAX_GIF_BYTES:
                 break
     return Rendered({checkpoint.env_steps: int(grid.reached.sum())}, robots, files)
@@ -152,10 +155,14 @@ def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
     return Rendered(successes, robots, {"image": png}, note_on_early(rates[chosen["early"]]))
 
 
+def _frame_count(grid: RobotGrid) -> int:
+    """Return the number of the video's frames."""
+    return math.ceil((max(grid.seconds, _PULL_BACK_SECONDS) + _HOLD_SECONDS) * FPS)
+
+
 def _video_frames(grid: RobotGrid, renderer: GridRenderer, aspect: float) -> Iterator[Frame]:
     """Render the video's frames, labelled with the time and the number of goals reached."""
-    seconds = max(grid.seconds, _PULL_BACK_SECONDS) + _HOLD_SECONDS
-    for number in range(math.ceil(seconds * FPS)):
+    for number in range(_frame_count(grid)):
         now = number / FPS
         camera = pull_back_camera(grid, renderer.fovy, aspect, now / _PULL_BACK_SECONDS)
         reached = int(grid.reached_at(grid.steps_at(now)).sum())

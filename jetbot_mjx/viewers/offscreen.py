@@ -22,11 +22,12 @@ samples per pixel, and on a CPU it takes two thirds of the time (one third for s
 _SHADOW_SIZE = 4096
 """Side of the shadow map [pixels]."""
 
-_SHADOW_REACH = 4.0
-"""Half the side of the floor that the shadow map covers [m]; one of its pixels is 2 mm wide."""
+_SHADOW_REACH = 6.0
+"""Half the side of the floor that the shadow map covers [m]; one of its pixels is 3 mm wide."""
 
-_SHADOW_MIDDLE = (1.5, -1.5)
-"""Middle of that floor [m]; beyond its corner at +x and -y, the floor would shade itself."""
+_SHADOW_MIDDLE = (2.5, -2.5)
+"""Middle of that floor [m]: beyond its corner at +x and -y, which views from behind the start see,
+the floor would shade itself."""
 
 _REACHED = np.array((0.20, 0.85, 0.30, 1.0), np.float32)
 _TRAIL = np.array((0.10, 0.35, 0.85, 1.0), np.float32)

@@ -43,7 +43,7 @@ HOLD_SECONDS = 0.6
 FADE_FRAMES = 8
 """Frames from the end of one episode to the start of the next."""
 
-# Lengths as fractions of the view's height.
+# Lengths as fractions of a view's shorter side.
 _INSET = (0.30, 0.225)  # width and height of the onboard camera's image
 _SEEN = 0.25  # longer side of what a policy sees
 _MARGIN = 0.03  # between the border and text or inset
@@ -148,7 +148,8 @@ class VideoRenderer(contextlib.ExitStack):
         super().__init__()
         self._fovy = float(env.mj_model.vis.global_.fovy)
         self._size, self._fps, self._shadows = size, fps, shadows
-        width, height = (round(share * size[1]) for share in _INSET)
+        self._side = min(size)
+        width, height = (round(share * self._side) for share in _INSET)
         self._policy_image = None
         if (camera := env.camera) is not None:
             self._policy_image = jax.jit(
@@ -236,13 +237,13 @@ class VideoRenderer(contextlib.ExitStack):
             image = self._inset.frame(qpos, markers, "onboard", shadows=False, reached=reached)
         else:
             seen = np.asarray(self._policy_image(qpos, markers))
-            image = resize_nearest(seen, round(_SEEN * self._size[1]))
+            image = resize_nearest(seen, round(_SEEN * self._side))
         return np.pad(image, ((2, 2), (2, 2), (0, 0)), constant_values=255)
 
     def _with_inset(self, view: Frame, inset: Frame) -> Frame:
         """Insert an image in the upper right corner of a view."""
         height, width = inset.shape[:2]
-        margin = round(_MARGIN * self._size[1])
+        margin = round(_MARGIN * self._side)
         left = self._size[0] - margin - width
         view = view.copy()
         view[margin : margin + height, left : left + width] = inset
@@ -257,7 +258,7 @@ class VideoRenderer(contextlib.ExitStack):
         ]
         if step == trajectory.steps:
             lines.append(("reached", REACHED) if trajectory.reached else ("missed", MISSED))
-        return with_lines(frame, lines, _TEXT * self._size[1], round(_MARGIN * self._size[1]))
+        return with_lines(frame, lines, _TEXT * self._side, round(_MARGIN * self._side))
 
 
 def _with_white_border(view: Frame) -> Frame:

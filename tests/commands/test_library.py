@@ -257,6 +257,7 @@ def test_a_default_is_that_of_the_commands():
         (lambda run: evaluate(run, episodes=2.5), InvalidError, "episodes = 2.5 is wrong: it"),
         (lambda run: evaluate(run, simulator="gym"), InvalidError, "simulator = 'gym' is unknown"),
         (lambda run: render("nowhere"), NotFoundError, "no checkpoint at"),
+        (lambda run: render(run, size=(640, 361)), InvalidError, "size = 640x361 is wrong: it"),
         (lambda run: render(run, episodes=0), InvalidError, "episodes = 0 is wrong: it should be"),
         (lambda run: render(run, goals=["3"]), InvalidError, "goals: '3' is wrong: give indices"),
         (lambda run: render(run, many=0), InvalidError, "robots = 0 is wrong: it should be a wh"),

@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 
 import jetbot_mjx
+from helpers.damage import damage_about
 from jetbot_mjx import __main__ as entry
 from jetbot_mjx import cli
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import TaskCode, write_task_code
 from jetbot_mjx.terminal import progress
 
 PAGE = Path(__file__).parents[2] / "docs" / "mistakes.md"
@@ -48,6 +50,7 @@ FILES = {
         "        return {}['missing']\n"
     ),
     "my_env.py": (
+        "import jax\n"
         "import jax.numpy as jnp\n"
         "from jetbot_mjx import State\n"
         "class Balance:\n"
@@ -74,6 +77,23 @@ FILES = {
         "    def step(self, state, action):\n"
         "        self.count += 1\n"
         "        return state.replace(reward=jnp.float32(self.count))\n"
+        "class Ending(Balance):\n"
+        "    def step(self, state, action):\n"
+        "        return state.replace(done=jnp.ones(()))\n"
+        "class Scoring(Balance):\n"
+        "    def step(self, state, action):\n"
+        "        return state.replace(info={'success': jnp.float32(2)})\n"
+        "    def reset(self, rng):\n"
+        "        return super().reset(rng).replace(info={'success': jnp.float32(0)})\n"
+        "@jax.custom_batching.custom_vmap\n"
+        "def rank(x):\n"
+        "    return x\n"
+        "@rank.def_vmap\n"
+        "def rank_of_a_batch(size, is_batched, x):\n"
+        "    return x - x.mean(), True\n"
+        "class Racing(Balance):\n"
+        "    def step(self, state, action):\n"
+        "        return state.replace(reward=rank(action[0]))\n"
     ),
     "my_env.yaml": "environment: my_env.py:Balance\n",
     "half_a_task.py": "class Docking(:\n",
@@ -92,11 +112,25 @@ def home(tmp_path_factory, smoke_run):
     for name in ("mine", "damaged"):
         shutil.copytree(smoke_run, folder / "runs" / name)
     shutil.copytree(smoke_run, folder / "runs" / "cut")
+    for name in ("theirs", "linked"):
+        shutil.copytree(smoke_run, folder / "runs" / name)
+    (folder / "runs" / "linked" / "policy").symlink_to(folder / "runs" / "other")
+    write_their_task(folder / "runs" / "theirs")
     cut = folder / "runs" / "cut" / "config.yaml"
     cut.write_text(cut.read_text()[:500])
     for path in (folder / "runs" / "damaged" / "checkpoints").glob("*/policy/**/d/*"):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     return folder
+
+
+def write_their_task(run_dir):
+    """Change a run to one of a task that its folder stores."""
+    write_task_code(run_dir, TaskCode("their_task", (("their_task.py", b"raise AssertionError"),)))
+    change = damage_about(lambda about: about["config"]["task"].update(name="their_task:Task"))
+    for checkpoint in (run_dir / "checkpoints").iterdir():
+        change(checkpoint)
+    config = run_dir / "config.yaml"
+    config.write_text(config.read_text().replace("jetbot_mjx:GoalTask", "their_task:Task"))
 
 
 @pytest.fixture

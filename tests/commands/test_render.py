@@ -74,7 +74,7 @@ def evaluator(smoke_run):
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """Films in few and small pictures."""
+    """Films in few pictures."""
     monkeypatch.setattr(gallery, "VideoRenderer", functools.partial(VideoRenderer, fps=5))
 
 
@@ -82,10 +82,11 @@ def coarse(monkeypatch):
 def filmed(monkeypatch):
     """The goals that would be rendered, without rendering them."""
     shots = []
+    sizes = []
 
     class Listener:
         def __init__(self, env, size):
-            assert size[0] * size[1] > 1
+            sizes.append(size)
 
         def __enter__(self):
             return self
@@ -118,14 +119,13 @@ def names(folder):
 
 
 def test_rendering_writes_a_video_a_gif_and_a_plot(run_copy, needs_opengl, coarse, capsys):
-    assert render.main([str(run_copy), "--episodes", "2", "--size", "160x90"]) == 0
+    assert render.main([str(run_copy), "--episodes", "2", "--size", "720x80"]) == 0
     (folder,) = (run_copy / "videos").iterdir()
     film = iio.imread(folder / "episodes-2.mp4", plugin="pyav")
-    assert film.shape[1:] == (90, 160, 3)
+    assert film.shape[1:] == (80, 720, 3)
     assert film.shape[0] > 8
-    assert np.abs(film[0].astype(int) - film[5]).mean() > 1  # it moves
-    assert np.abs(film[-1].astype(int) - film[0]).mean() < 6  # its end fades into its start
-    assert iio.imread(folder / "episodes-2.gif").shape[1:] == (90, 160, 3)
+    assert np.abs(film[0].astype(int) - film[5]).max() > 50  # it moves
+    assert iio.imread(folder / "episodes-2.gif").shape[1:] == (71, 640, 3)
     assert iio.imread(folder / "trajectories-2.png").shape[0] > 400
     shown = capsys.readouterr().out
     for name in ("episodes-2.mp4", "episodes-2.gif", "trajectories-2.png"):
@@ -179,9 +179,15 @@ def test_goals_are_written_as_indices_and_ranges(text, goals, name):
         (["--goals", "7-3"], "7-3 is a reversed range: write 3-7"),
         (["--goals", "3,1-4"], "goal 3 is given twice: give it once"),
         (["--goals", "3", "--episodes", "2"], "--episodes: not allowed with argument --goals"),
-        (["--size", "1280"], "'1280' is not a size: give two even numbers from 64 to 4096"),
-        (["--size", "641x360"], "'641x360' is not a size"),
-        (["--size", "9998x2"], "such as 1280x720"),
+        (["--size", "1280"], "--size: '1280' is not a size: write it as in 1280x720"),
+        (["--size", "1280x720p"], "--size: '1280x720p' is not a size"),
+        (
+            ["--size", "1280x719"],
+            "--size: size = 1280x719 is wrong: it should be two even numbers from 64 to 4096",
+        ),
+        (["--size", "62x720"], "--size: size = 62x720 is wrong"),
+        (["--size", "1280x4098"], "--size: size = 1280x4098 is wrong"),
+        (["--size", "640x480", "--strip"], "--size: cannot be combined with --strip"),
         (["--gallery", "--goals", "3"], "--goals: cannot be combined with --gallery"),
         (["--gallery", "--checkpoint", "last"], "--checkpoint: cannot be combined with --gallery"),
     ],
@@ -258,14 +264,19 @@ def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys, s
 
 
 def test_a_gallery_has_a_video_an_animation_and_a_sheet(run_copy, needs_opengl, coarse):
-    rendered = render_gallery(run_copy, episodes=2, size=(242, 80))
+    rendered = render_gallery(run_copy, episodes=2, size=(250, 80))
     film = iio.imread(rendered.files["video"], plugin="pyav")
-    assert film.shape[1:] == (80, 240, 3)
+    assert film.shape[1:] == (80, 246, 3)  # three equal widths, together even
     assert names(run_copy / "videos") == ["gallery-2.gif", "gallery-2.mp4", "gallery-2.png"]
-    assert iio.imread(rendered.files["gif"]).shape[1:] == (80, 240, 3)
+    assert iio.imread(rendered.files["gif"]).shape[1:] == (80, 246, 3)
     height, width, _ = iio.imread(rendered.files["plots"]).shape
     assert width == 3 * height
     assert list(rendered.successes) == [0, 32_768, 65_536]
+
+
+def test_the_smallest_gallery_is_rendered(run_copy, needs_opengl, coarse):
+    rendered = render_gallery(run_copy, episodes=1, size=(64, 64))
+    assert iio.imread(rendered.files["video"], plugin="pyav").shape[1:] == (64, 60, 3)
 
 
 def test_one_checkpoint_makes_no_gallery(run_copy):

@@ -51,6 +51,29 @@ def test_the_hash_is_of_all_of_them(model):
         (" \n", "it is empty"),
         ('<mujoco><geom pos="0 -NaN 0"/></mujoco>', "<geom pos='0 -NaN 0'> holds NaN: give a"),
         (b"\xff\xfe<\0", "this is not UTF-8 text, as MJCF is"),
+        (
+            '<mujoco><flexcomp file="/etc/hosts"/></mujoco>',
+            "<flexcomp file='/etc/hosts'> names a file",
+        ),
+        (f"<mujoco>{'<a>' * 10**5}{'</a>' * 10**5}</mujoco>", "it is nested too deeply"),
+        ('<mujoco><replicate count="all"/></mujoco>', "a count is no whole number"),
+        (f"<mujoco>{'<geom/>' * 10**4}</mujoco>", "it stands for 10,001 elements"),
+        (
+            '<mujoco><replicate count="99999"><replicate count="99999"/></replicate></mujoco>',
+            "it stands for 9,999,900,001 elements",
+        ),
+        ('<mujoco><composite count="99 99 99"/></mujoco>', "it stands for 970,300 elements"),
+        (f"<mujoco>{'<attach/>' * 17}</mujoco>", "attaches 17 models: at most 10,000 and 16"),
+        (
+            '<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/hosts">]><mujoco>&b;</mujoco>',
+            "this is not XML: undefined entity &b;",
+        ),
+        (
+            f"<!DOCTYPE a [<!ENTITY a0 '{'a' * 99}'>"
+            + "".join(f"<!ENTITY a{i + 1} '{f'&a{i};' * 99}'>" for i in range(6))
+            + "]><mujoco>&a6;</mujoco>",
+            "this is not XML: limit on input amplification factor",
+        ),
     ],
 )
 def test_what_is_no_model_is_refused_in_one_line(model, text, said):

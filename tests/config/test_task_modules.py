@@ -171,6 +171,6 @@ def test_an_example_in_an_installed_package_is_stored_in_its_run(tmp_path, root,
     assert [path for path, _ in code.files] == ["gates_task.py"]
     write_task_code(tmp_path, code)
     shutil.rmtree(examples)
-    found = stored_class(tmp_path, config.task.name, silent=True)
+    found = stored_class(tmp_path, config.task.name, code, silent=True)
     assert found is not None
     assert found.__name__ == "GatesTask"

@@ -10,6 +10,7 @@ from helpers.command_modules import train
 from jetbot_mjx import cli
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import make_env
+from jetbot_mjx.envs.checks import own_environment
 from jetbot_mjx.envs.checks.own_environment import (
     ENVIRONMENT_CHECKS,
     check_environment,
@@ -33,9 +34,16 @@ BROKEN = {
     "DrawsAResetFromNumpy": "reset and step are another program each time",
     "NamesAMetricAnewEachTime": "a step changes the state's metrics['speed_",
     "ResetsSlowly": "s, and every episode begins with one: compute in __init__ what all episodes",
-    "IsAlwaysDone": "done is 1 in every step: it should be 1 only where an episode ends",
+    "IsAlwaysDone": "done is 1 in the first step of every episode: it should be 1 only where an",
+    "EndsAtOnce": "done is 1 in the first step of every episode: it should be 1 only where an",
     "IsHalfDone": "done is 0.5 in a step: it should be 0 or 1",
     "IsDoneByMinusOne": "done is -1 in a step: it should be 0 or 1",
+    "HalfSucceeds": "success is 0.5 in a step: it should be 0 or 1",
+    "CountsItsSuccesses": "success is 2 in a step: it should be 0 or 1",
+    "SucceedsByNothing": "metrics['success'] is not finite in 1,024 of 1,024 steps",
+    "ComparesInstances": "a step of 16 instances gives another reward than each of them alone: no",
+    "ResetsTheBatch": "a reset of 16 instances gives another obs than each of them alone: no",
+    "CallsOneInPython": "a batch of steps raises NotImplementedError: vmap is only supported",
     "ObservesAMatrix": "observation has the shape [1, 2]: it should be a vector, such as x.ravel()",
     "ObservesImages": "observation['pixels'] has the shape [8, 8, 3]: it should be a vector",
     "ObservesNothing": "observation is empty: it should be a vector",
@@ -94,9 +102,19 @@ def type_(tmp_path, monkeypatch, capfd):
     return type_
 
 
+@pytest.fixture
+def resets_are_slow_after_10_ms(monkeypatch):
+    """However fast the machine is, a reset that counts to a million is slow."""
+    monkeypatch.setattr(own_environment, "_LONGEST_RESET", 0.01)
+
+
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_mistake_is_one_line_and_nothing_is_written(type_, name):
-    line = type_(f"environment: helpers.broken_environments:{name}\n")
+def test_a_mistake_is_one_line_and_nothing_is_written(type_, name, request):
+    if name == "ResetsSlowly":
+        request.getfixturevalue("resets_are_slow_after_10_ms")
+    # Few steps, so that a training which should not have begun ends.
+    few = "ppo: {num_timesteps: 1000}\n"
+    line = type_(f"environment: helpers.broken_environments:{name}\n{few}")
     assert line.startswith("error: ")
     assert f"environment = 'helpers.broken_environments:{name}'" in line
     assert BROKEN[name] in line
@@ -134,6 +152,10 @@ def test_a_rare_state_that_is_not_finite_is_left_to_the_training():
     # The command that looks for mistakes tells it.
     (finding,) = dict(check_environment(config))["drive"]
     assert finding.startswith("reward is not finite in ")
+
+
+def test_an_environment_need_not_end():
+    assert dict(check_environment(config_of("NeverEnds"))) == {x: [] for x in ENVIRONMENT_CHECKS}
 
 
 def test_each_check_is_told_up_to_the_first_with_findings():

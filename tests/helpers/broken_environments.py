@@ -107,13 +107,24 @@ class NamesAMetricAnewEachTime(Point):
 class ResetsSlowly(Point):
     def reset(self, rng):
         first = super().reset(rng)
-        x = jax.lax.fori_loop(0, 30_000_000, lambda i, x: jnp.sin(x + 0.1), first.obs[0])
+        x = jax.lax.fori_loop(0, 1_000_000, lambda i, x: jnp.sin(x + 0.1), first.obs[0])
         return first.replace(obs=first.obs.at[0].set(x))
 
 
 class IsAlwaysDone(Point):
     def step(self, state, action):
         return super().step(state, action).replace(done=jnp.ones(()))
+
+
+class EndsAtOnce(Point):
+    """It takes the first step of an episode for its last."""
+
+    def reset(self, rng):
+        return super().reset(rng).replace(info={"t": jnp.zeros(())})
+
+    def step(self, state, action):
+        info = {"t": state.info["t"] + 1.0}
+        return super().step(state, action).replace(done=jnp.float32(info["t"] == 1), info=info)
 
 
 class IsHalfDone(Point):
@@ -124,6 +135,60 @@ class IsHalfDone(Point):
 class IsDoneByMinusOne(Point):
     def step(self, state, action):
         return super().step(state, action).replace(done=-jnp.ones(()))
+
+
+class HalfSucceeds(Point):
+    def state(self, x, speed, metrics):
+        return super().state(x, speed, metrics | {"success": 0.5 * (x > 0)})
+
+
+class CountsItsSuccesses(Point):
+    def state(self, x, speed, metrics):
+        state = super().state(x, speed, metrics)
+        return state.replace(info={"success": jnp.float32(2.0)})
+
+
+class SucceedsByNothing(Point):
+    def state(self, x, speed, metrics):
+        return super().state(x, speed, metrics | {"success": jnp.log(-1.0 - x**2)})
+
+
+@jax.custom_batching.custom_vmap
+def advantage(reward):
+    return reward
+
+
+@advantage.def_vmap
+def advantage_of_a_batch(size, is_batched, reward):
+    return reward - reward.mean(), True
+
+
+class ComparesInstances(Point):
+    """The reward is what an instance has more than the others."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return after.replace(reward=advantage(after.reward))
+
+
+class ResetsTheBatch(Point):
+    """All instances begin at the place of the first."""
+
+    def reset(self, rng):
+        def same_place(x):
+            return np.full_like(x, np.asarray(x).flat[0])
+
+        like = jax.ShapeDtypeStruct((), jnp.float32)
+        x = jax.random.uniform(rng)
+        x = jax.pure_callback(same_place, like, x, vmap_method="broadcast_all")
+        return self.state(x, jnp.zeros(()), {"speed": ZERO})
+
+
+class CallsOneInPython(Point):
+    def step(self, state, action):
+        after = super().step(state, action)
+        like = jax.ShapeDtypeStruct((), jnp.float32)
+        return after.replace(reward=jax.pure_callback(np.sin, like, after.reward))
 
 
 class ObservesAMatrix(Point):
@@ -259,6 +324,13 @@ class Sorts(Point):
     def step(self, state, action):
         after = super().step(state, action)
         return after.replace(reward=after.reward + jnp.linalg.eigh(jnp.diag(after.obs))[0][0])
+
+
+class NeverEnds(Point):
+    """The time limit is the trainer's."""
+
+    def step(self, state, action):
+        return super().step(state, action).replace(done=ZERO)
 
 
 class Sound(Point):

@@ -9,6 +9,7 @@ from jetbot_mjx.config import Config
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.runs.checkpoint import about_policy
 from jetbot_mjx.runs.checkpoint_store import CheckpointStore
+from jetbot_mjx.runs.trust import record_code
 
 
 def write_untrained_run(folder, config: Config, steps=(0,)):
@@ -17,6 +18,7 @@ def write_untrained_run(folder, config: Config, steps=(0,)):
     size, actions = env.observation_size, env.action_size
     networks = make_networks(config.ppo, size, actions)
     folder.mkdir()
+    record_code(folder, config, None)
     with CheckpointStore(folder, keep=len(steps)) as checkpoints:
         for env_steps in steps:
             key = jax.random.PRNGKey(env_steps)

@@ -39,7 +39,7 @@ everywhere = gliding.everywhere()
 everywhere.__enter__()
 atexit.register(everywhere.__exit__, None, None, None)  # not before, though its name is forgotten
 from jetbot_mjx.viewers import gallery, video
-gallery.VideoRenderer = functools.partial(video.VideoRenderer, size=(64, 64), fps=2)
+gallery.VideoRenderer = lambda env, size: video.VideoRenderer(env, (128, 64), fps=2)
 """
 """What the kernel begins with: a robot that glides, and small videos."""
 

@@ -6,7 +6,6 @@ import math
 import os
 import re
 import shutil
-import struct
 import threading
 import time
 import types
@@ -15,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 from PIL import Image
-from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.proto.layout_pb2 import Layout
 from tensorboardX.proto.plugin_hparams_pb2 import HParamsPluginData
 
+from helpers.tensorboard_files import events, read_events
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.runs import metrics
 from jetbot_mjx.runs.metrics import (
@@ -29,7 +28,6 @@ from jetbot_mjx.runs.metrics import (
     mean_of,
     read_history,
 )
-from helpers.tensorboard_files import events, read_events
 
 
 def lines_of(path):
@@ -163,10 +161,6 @@ def test_a_full_disk_is_not_hidden(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space left"):
         sink.write(1, {})
     sink.close()
-
-
-
-
 
 
 def test_tensorboard_events_can_be_read_again(tmp_path):

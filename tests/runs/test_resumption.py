@@ -18,10 +18,10 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
-from helpers.command_modules import train
-from helpers.tensorboard_files import read_events
-from helpers.fake_wandb import FakeWandb
 
+from helpers.command_modules import train
+from helpers.fake_wandb import FakeWandb
+from helpers.tensorboard_files import read_events
 from jetbot_mjx import load_config, make_env, training
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.config import CHANGEABLE_ON_RESUME
@@ -577,9 +577,7 @@ def test_progress_that_no_training_has_written_costs_one_line(run_copy, states, 
     assert said.startswith(f"{run_copy}: the last checkpoint has unusable metadata: {key}")
 
 
-def test_with_all_checkpoints_damaged_nothing_is_moved(
-    run_copy, config, template, capfd
-):
+def test_with_all_checkpoints_damaged_nothing_is_moved(run_copy, config, template, capfd):
     for env_steps in STEPS:
         cut(checkpoint_path(run_copy, env_steps) / "about" / "metadata")
     before = contents(run_copy)

@@ -158,19 +158,18 @@ class Killed(BaseException):
     """Stands for the end of the process."""
 
 
-@pytest.mark.parametrize("method", ["write_bytes", "replace"])
-def test_a_file_is_whole_or_as_it_was_whenever_the_process_ends(tmp_path, monkeypatch, method):
+@pytest.mark.parametrize(("owner", "method"), [(os, "fsync"), (Path, "replace")])
+def test_a_file_is_whole_or_as_it_was_whenever_the_process_ends(
+    tmp_path, monkeypatch, owner, method
+):
     path = tmp_path / "config.yaml"
     write_text(path, "before\n")
-    original = getattr(Path, method)
 
-    def die(self, argument, **keywords):
-        if method == "write_bytes":
-            original(self, argument[: len(argument) // 2], **keywords)
+    def die(*arguments):
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, method, die)
+        patch.setattr(owner, method, die)
         with pytest.raises(Killed):
             write_text(path, "after, and longer than before\n")
     assert path.read_text() == "before\n"

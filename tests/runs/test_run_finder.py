@@ -9,7 +9,6 @@ import pytest
 
 from helpers.run_folders import make_run
 from jetbot_mjx import list_runs as list_runs_command
-from jetbot_mjx.config import ConfigError, find_config, load_config, parse_config, shipped_configs
 from jetbot_mjx.errors import NotFoundError
 from jetbot_mjx.runs.checkpoint import find_checkpoint, load_checkpoint, load_policy
 from jetbot_mjx.runs.checkpoint_store import CheckpointError
@@ -21,10 +20,6 @@ from jetbot_mjx.runs.run_finder import (
     runs_table,
     scan_runs,
 )
-
-
-
-
 
 
 @pytest.fixture
@@ -191,15 +186,7 @@ def test_no_name_can_command_the_terminal(runs, capsys):
     assert lines[5].startswith(r"damaged: \x1b]0;title\x07: config.yaml was cut off")
 
 
-
-
-
-
 # Configurations.
-
-
-
-
 
 
 def test_a_run_in_an_environment_shows_its_name_and_return(runs):

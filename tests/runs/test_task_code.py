@@ -5,9 +5,9 @@ import json
 import sys
 import textwrap
 
-from helpers import gliding
 import pytest
 
+from helpers import gliding
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.mujoco_env import MujocoJetBot
@@ -18,7 +18,6 @@ from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.task_code import (
     collect_task_code,
     read_task_code,
-    stored_class,
     write_task_code,
 )
 from jetbot_mjx.training import session
@@ -51,6 +50,12 @@ def forget(monkeypatch):
     """Each test imports its task, and gets its messages, for the first time."""
     monkeypatch.setattr(task_code, "_said", set())
     monkeypatch.setattr(task_code, "_modules", {})
+
+
+def stored_class(run_dir, name):
+    """The class from the source that a run stored, if it stored any."""
+    code = read_task_code(run_dir)
+    return code and task_code.stored_class(run_dir, name, code)
 
 
 def own_modules():
@@ -315,13 +320,13 @@ def test_a_run_is_whole_without_the_module_and_resumes_with_its_own_task(
     assert load_checkpoint(run_dir).make_env().task.factor == 3
     monkeypatch.setattr(task_code, "_said", set())
     capsys.readouterr()
-    task_class, code = session._find_code(config.task.name, [run_dir])
+    task_class, code = session._find_code(config, [run_dir])
     assert (task_class.factor, code) == (3, None)
     assert f"{NAME} on disk differs from the code this run was" in capsys.readouterr().err
     # A new run has the new one, in the folders of all of its seeds.
     two = parse_config({**config.model_dump(), "seeds": 2})
     run_dirs = [tmp_path / "two" / f"seed-{n}" for n in (0, 1)]
-    task_class, code = session._find_code(config.task.name, run_dirs)
+    task_class, code = session._find_code(config, run_dirs)
     assert task_class is None
     assert dict(code.files)["kicking_tools.py"] == TOOLS.format(4).encode()
     for folder in run_dirs:

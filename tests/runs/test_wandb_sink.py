@@ -7,22 +7,17 @@ import os
 import shutil
 import subprocess
 import sys
-import types
 from pathlib import Path
 
 import pytest
-from helpers.command_modules import train
 
+from helpers.command_modules import train
+from helpers.fake_wandb import FakeWandb
 from jetbot_mjx import load_config
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.metrics import History
 from jetbot_mjx.runs.wandb_sink import WandbSink, check_tracking
-from helpers.fake_wandb import FakeWandb
-
-
-
-
 
 
 @pytest.fixture

@@ -2,11 +2,11 @@
 
 import shutil
 
-from helpers import gliding, point_mass
 import jax
 import numpy as np
 import pytest
 
+from helpers import gliding, point_mass
 from jetbot_mjx.agents.networks import make_networks, make_policy
 from jetbot_mjx.config import ConfigError, parse_config
 from jetbot_mjx.envs.build import make_env

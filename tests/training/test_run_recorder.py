@@ -178,7 +178,7 @@ def test_videos_change_no_bit_of_a_training(root, smoke_run, tmp_path, monkeypat
         opengl.find_backend()
     except UserError as error:
         pytest.skip(str(error))
-    monkeypatch.setattr(video.EvaluationVideo, "_SIDE", 64)
+    monkeypatch.setattr(video.EvaluationVideo, "_SIZE", (64, 64))
     monkeypatch.setattr(video.EvaluationVideo, "_FPS", 2.0)
     settings = ["evaluation.video=true", "ppo.num_timesteps=16384"]
     config = load_config(root / "configs" / "smoke.yaml", settings)

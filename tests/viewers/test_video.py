@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from pathlib import Path
+import os
 
 import imageio.v3 as iio
 import jax
@@ -28,7 +28,7 @@ from jetbot_mjx.viewers.video import (
     write_mp4,
 )
 
-SIDE, FPS = 240, 10.0
+WIDTH, HEIGHT, FPS = 240, 120, 10.0
 DT = 1 / 60
 
 
@@ -55,7 +55,7 @@ def drive(world_env):
 
 @pytest.fixture(scope="module")
 def renderer(world_env, needs_opengl):
-    with VideoRenderer(world_env, (SIDE, SIDE), FPS) as renderer:
+    with VideoRenderer(world_env, (WIDTH, HEIGHT), FPS) as renderer:
         yield renderer
 
 
@@ -116,7 +116,7 @@ def test_goal_time_distance_and_outcome_are_written_in(renderer, drive, written,
     assert written[:2] == ["goal 7 0.00 s", "0.58 m to go"]
     assert written[-3:] == ["goal 7 0.50 s", "0.30 m to go", outcome]
     assert written.count(outcome) == 1
-    assert frames[0].shape == (SIDE, SIDE, 3)
+    assert frames[0].shape == (HEIGHT, WIDTH, 3)
     # Real time, and then it stands for a while.
     assert len(frames) == 1 + 0.5 * FPS + round(video.HOLD_SECONDS * FPS)
     assert all(np.array_equal(frames[5], frame) for frame in frames[6:])
@@ -126,8 +126,8 @@ def test_finished_robots_stop_while_the_others_drive(renderer, drive, written):
     short, long = drive((0.3, 0.0), (0.4, 0.0)), drive((-0.9, 0.0), (0.4, 0.0), reached=False)
     frames = list(renderer.render_side_by_side([("0 steps", short), ("9 steps", long)]))
     assert len(frames) == 1 + 0.9 * FPS + round(video.HOLD_SECONDS * FPS)
-    assert frames[0].shape == (SIDE, 2 * SIDE, 3)
-    left, right = ([frame[:, at : at + SIDE] for frame in frames] for at in (0, SIDE))
+    assert frames[0].shape == (HEIGHT, 2 * WIDTH, 3)
+    left, right = ([frame[:, at : at + WIDTH] for frame in frames] for at in (0, WIDTH))
     assert all(np.array_equal(left[3], panel) for panel in left[4:])
     for before, after in itertools.pairwise(right[:10]):
         assert not np.array_equal(before, after)
@@ -156,12 +156,29 @@ def test_the_edges_of_shadows_are_fine(renderer):
     assert width / model.vis.quality.shadowsize < 0.004  # [m]; a pixel of the chase view is 3 mm
 
 
-@pytest.mark.parametrize("size", [(240, 240), (426, 240), (320, 400)])
-def test_text_and_inset_stay_above_what_happens(world_env, drive, size, needs_opengl):
-    """Their pixels are those that differ from the bare view."""
+def test_the_floor_does_not_shade_itself(world_env, needs_opengl):
+    """Seven metres of it: where nothing stands, shadows add no edges."""
+    camera = mujoco.MjvCamera()
+    camera.azimuth, camera.elevation, camera.distance = 0.0, -50.0, 7.0
+    model = offscreen.with_metre_grid(world_env.mj_model)
+
+    def edges(frame):
+        return np.abs(np.diff(frame.astype(int).sum(axis=-1), axis=1))
+
+    with offscreen.Renderer(model, width=320, height=320) as renderer:
+        draw = functools.partial(renderer.frame, model.qpos0, {"goal": (0, 0, -9)}, camera)
+        added = np.abs(edges(draw()) - edges(draw(shadows=False)))
+    added[140:200, 140:180] = 0  # the robot
+    assert (added > 30).sum() < 10
+
+
+def test_text_and_inset_stay_above_what_happens(world_env, drive, needs_opengl):
+    """Their pixels are those that differ from the bare view, the narrowest of a gallery."""
     one = drive((1.5, 1.5), (-1.0, -0.5), number=1023, reached=False)
-    with VideoRenderer(world_env, size, FPS) as renderer:
+    width, height = 426, 480
+    with VideoRenderer(world_env, (width, height), FPS) as renderer:
         camera = renderer._overview([one])
+        renderer._episode_view("", one, camera, 0)  # a first image may be rounded otherwise
         panel = renderer._episode_view("123,456,789 steps", one, camera, one.steps)
         bare = renderer._view.frame(
             one.qpos[-1],
@@ -170,17 +187,19 @@ def test_text_and_inset_stay_above_what_happens(world_env, drive, size, needs_op
             trail_w=one.trail_w(one.steps),
             lines_w=offscreen.METRE_LABELS,
         )
-    rows, columns = np.nonzero(np.abs(panel.astype(int) - bare).max(axis=-1) > 3)
-    assert rows.min() < 0.05 * size[1]
-    assert rows.max() < (1 - video._FILLED["above"]) / 2 * size[1]
-    assert columns.max() > 0.9 * size[0]
+    rows, columns = np.nonzero((panel != bare).any(axis=-1))
+    assert rows.min() < 0.05 * height
+    assert rows.max() < (1 - video._FILLED["above"]) / 2 * height
+    assert columns.max() > 0.9 * width
+    # And they are not on top of each other: bare columns lie between them.
+    assert set(range(columns.max())) - set(columns)
 
 
 def test_the_inset_is_what_the_robot_sees(renderer, drive):
     def red_in_corner(goal_w):
         one = drive((0.0, 0.2), goal_w)
         frame = next(renderer.render_episode(one)).astype(int)
-        corner = frame[: round(0.28 * SIDE), SIDE - round(0.34 * SIDE) : SIDE]
+        corner = frame[: round(0.28 * HEIGHT), WIDTH - round(0.34 * HEIGHT) :]
         r, g, b = np.moveaxis(corner, -1, 0)
         return int(((r > 90) & (r > 3 * g) & (r > 3 * b)).sum())
 
@@ -188,31 +207,38 @@ def test_the_inset_is_what_the_robot_sees(renderer, drive):
     assert red_in_corner((-0.9, 0.0)) == 0
 
 
-def test_the_floor_has_a_thick_line_each_metre_and_a_thin_one_each_quarter(world_env, needs_opengl):
-    """Seen from above: along x at y = 0.125, between the lines that are parallel to it."""
-    model = offscreen.with_metre_grid(world_env.mj_model)
+def test_the_floor_has_a_grid_and_labels(world_env, needs_opengl):
+    """A square metre of it, from straight above: its borders are dark, and labels are in it."""
+    qpos = world_env.mj_model.qpos0.copy()
+    qpos[0] = 5.0  # out of sight
     camera = mujoco.MjvCamera()
-    camera.lookat[:] = 0.125, 0.0, 0.0
-    camera.distance, camera.elevation, camera.azimuth = 2.0, -90.0, 0.0
-    away = {"goal": (9.0, 9.0, 0.0)}
-    qpos = model.qpos0 + np.eye(model.nq)[0] * 9
-    with offscreen.Renderer(model, width=800, height=100) as renderer:
-        image = renderer.frame(qpos, away, camera, shadows=False)
-    row = image[20].mean(axis=-1)
-    scale = 50 / (2.0 * np.tan(np.radians(model.vis.global_.fovy) / 2))  # [pixels/m]
-    place = (np.arange(800) - 399.5) / scale
-    # Thin lines are fainter than a pixel is wide.
-    lines, thick = place[row < row.max() - 1], place[row < row.max() - 30]
-    assert set(np.round(4 * lines[np.abs(lines) < 2.1])) == set(range(-8, 9))
-    assert set(np.round(4 * thick[np.abs(thick) < 2.1])) == {-8, -4, 0, 4, 8}
-    assert model.tex_data.sum() != world_env.mj_model.tex_data.sum()
+    camera.lookat[:] = (0.5, -0.5, 0.0)
+    camera.azimuth, camera.elevation = 0.0, -90.0
+    with offscreen.Renderer(
+        offscreen.with_metre_grid(world_env.mj_model), width=240, height=240
+    ) as renderer:
+        # Half a metre beyond the square on every side.
+        camera.distance = 1.0 / np.tan(np.radians(world_env.mj_model.vis.global_.fovy / 2))
+        draw = functools.partial(renderer.frame, qpos, {"goal": (9, 9, 0)}, camera, shadows=False)
+        floor, labelled = draw().astype(int), draw(lines_w=offscreen.METRE_LABELS).astype(int)
+    across = floor[100:110].mean(axis=(0, 2))
+    darkest = {at for at in range(2, 238) if across[at] < across[[at - 2, at + 2]].min() - 20}
+    assert {round(at / 30) for at in darkest} == {2, 6}  # at whole metres
+    fine = {at for at in range(2, 238) if across[at] < across[[at - 2, at + 2]].min() - 3}
+    assert {round(at / 30) for at in fine} == {1, 2, 3, 4, 5, 6, 7}  # every quarter
+    # "1 m" at one metre ahead and at one metre to the right.
+    marked = np.argwhere(np.abs(labelled - floor).max(axis=-1) > 30)
+    assert {tuple(place) for place in np.round(marked / 60).astype(int).tolist()} == {
+        (1, 1),
+        (3, 3),
+    }
 
 
-def test_videos_are_joined_to_a_loop():
-    black, grey, white = (np.full((2, 2, 3), value, np.uint8) for value in (0, 100, 200))
-    joined = [int(frame[0, 0, 0]) for frame in video.join([[black, grey], [white]], 3)]
-    assert joined == [0, 100, 125, 150, 175, 200, 150, 100, 50]
-    assert list(video.join([[], []])) == []
+def test_the_end_of_a_video_fades_into_its_start():
+    dark, light = (np.full((2, 2, 3), shade, np.uint8) for shade in (0, 200))
+    shades = [int(frame.mean()) for frame in video.join([[dark, dark], [light]], fade_frames=3)]
+    assert shades == [0, 0, 50, 100, 150, 200, 150, 100, 50]
+    assert list(video.join([])) == []
 
 
 @pytest.fixture(scope="module")
@@ -229,20 +255,26 @@ def test_what_a_policy_sees_is_in_the_upper_right_corner(
     qpos = jnp.asarray(one.qpos[0])
     seen = np.asarray(camera.render(camera.pose(qpos[QPOS_XYZ], qpos[QPOS_QUAT]), one.markers))
     assert ((seen[..., 0] > 90) & (seen[..., 1] < 40)).any()  # the cube
-    with VideoRenderer(seeing_env, (SIDE, SIDE), FPS) as renderer:
+    width, height = 480, 240
+    with VideoRenderer(seeing_env, (width, height), FPS) as renderer:
         frame = next(renderer.render_episode(one))
-        margin, border, square = round(0.03 * SIDE), 2, 4
-        right = SIDE - margin - border
-        inner = frame[margin + border :, right - 16 * square : right][: 12 * square]
+        margin, border, square = round(0.03 * height), 2, 4
+        right = width - margin
+        corner = frame[margin : margin + 12 * square + 2 * border, :right][
+            :, -16 * square - 2 * border :
+        ]
+        inner = corner[border:-border, border:-border]
         np.testing.assert_allclose(inner[::square, ::square].astype(int), seen, atol=1)
         np.testing.assert_array_equal(inner[::square], inner[1::square])
-        assert (frame[margin : margin + border, right - 16 * square : right] == 255).all()
-        # The text is at the upper left, of each of several views too.
+        assert (corner[:border] == 255).all()
+        assert (corner[:, -border:] == 255).all()
+        # The text is at the upper left, of several views in each.
         assert written[0] == "goal 7 0.00 s"
-        assert max(x for x, _ in places) < SIDE / 4
         views = next(renderer.render_side_by_side([("0 steps", one), ("9 steps", one)]))
-        corner = views[margin + border :, right - 16 * square : right][: 12 * square]
-        np.testing.assert_array_equal(corner, inner)
+        assert {x < 0.1 * width for x, _ in places} == {True}
+        np.testing.assert_array_equal(
+            views[margin:, : width + right][: len(corner), -len(corner[0]) :], corner
+        )
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -332,14 +364,13 @@ def test_an_animation_keeps_the_colours_of_small_things(tmp_path):
 def test_a_file_is_whole_or_as_it_was(tmp_path, monkeypatch, write):
     path = tmp_path / "a.film"
     path.write_bytes(b"as it was")
-    original = Path.write_bytes
 
-    def full(self, content):
-        original(self, content[:10])
+    def full(descriptor):
+        os.ftruncate(descriptor, 10)
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", full)
+        patch.setattr(os, "fsync", full)
         with pytest.raises(OSError, match="No space"):
             write(path, frames(3))
     assert [one.name for one in tmp_path.iterdir()] == ["a.film"]

@@ -1,23 +1,34 @@
 """Check an environment of one's own: its traces, and a short drive of a few instances.
 
 A training would run for minutes on a reward that is not a number, or with a state that is kept in
-`self`. Here both are found in about a second, before anything of PPO is compiled.
+`self`. Here both are found before anything of PPO is compiled.
+
+Protocol:
+
+1. Trace reset and step once more: an impure one is another program each time.
+2. Compare a batch with single instances, if a batch may be something else: JAX batches all its own
+   operations, and not what the user batches.
+3. Drive a few instances, and look at all that they return. Most of the time is that of lowering
+   physics to a kernel, which the training needs as well and does not repeat.
 """
 
 import functools
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jax.extend.core import Jaxpr, jaxprs_in_params
+from jaxtyping import Array, Float, PyTree, UInt32
 
 import onekernel
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.adapted_env import AdaptedEnv
+from jetbot_mjx.envs.checks.errors import describe_error
 from jetbot_mjx.envs.checks.probe import first_key
+from jetbot_mjx.envs.foreign import SUCCESS
 from jetbot_mjx.envs.program_key import own_fingerprint
 from jetbot_mjx.envs.robot_facts import step_rate
 from jetbot_mjx.envs.state import State
@@ -42,7 +53,9 @@ _RARE = 0.01
 ENVIRONMENT_CHECKS: Mapping[str, str] = {
     "interface": "it can be imported and built, and reset and step trace for one instance",
     "purity": "reset and step trace twice into the same program",
-    "drive": f"{INSTANCES} instances for {STEPS} steps: finite, done is 0 or 1, resets are quick",
+    "batch": "a batch of instances makes the steps that each of them makes alone",
+    "drive": f"{INSTANCES} instances for {STEPS} steps: finite, done and success are 0 or 1, resets"
+    " are quick",
 }
 """What `check_environment` looks at, by the name of each check, in their order."""
 
@@ -63,10 +76,12 @@ def check_environment(config: Config) -> Iterator[tuple[str, list[str]]]:
         yield "interface", [str(error)]
         return
     yield "interface", []
-    findings = list(_impurities(env))
-    yield "purity", findings
-    if not findings:
-        yield "drive", list(_faults(env, rare=0.0))
+    checks = {"purity": _impurities(env), "batch": _unlike_alone(env), "drive": _faults(env, 0.0)}
+    for name, found in checks.items():
+        findings = list(found)
+        yield name, findings
+        if findings:
+            return
 
 
 def describe_environment(config: Config) -> Iterator[tuple[str, str]]:
@@ -104,10 +119,11 @@ def require_sound(env: AdaptedEnv) -> None:
       env: the environment.
 
     Raises:
-      InvalidError: it is another program each time, or a short drive of it went wrong.
+      InvalidError: it is another program each time, a batch of instances makes other steps than
+        each of them alone, or a short drive of it went wrong.
     """
-    for find in (_impurities, _faults):
-        found = next(find(env), None)
+    for findings in (_impurities(env), _unlike_alone(env), _faults(env)):
+        found = next(findings, None)
         if found:
             raise InvalidError(f"environment = {env.config.environment!r}: {found}")
 
@@ -135,22 +151,25 @@ def _faults(env: AdaptedEnv, rare: float = _RARE) -> Iterator[str]:
       rare: the share of steps that may be non-finite.
     """
     keys = jax.random.split(first_key(), INSTANCES)
-    reset = _compiled(jax.jit(jax.vmap(env.reset)).trace(keys))
-    begin = time.perf_counter()
-    first = jax.block_until_ready(reset(keys))
-    seconds = time.perf_counter() - begin
+    told, seconds = _timed(functools.partial(_drive, env), keys)
+    if seconds > _LONGEST_RESET:
+        # Find out whether it was the resets.
+        _, seconds = _timed(jax.vmap(env.reset), keys)
     if seconds > _LONGEST_RESET:
         yield (
             f"a reset of {INSTANCES} instances takes {seconds:.1f} s, and every episode begins with"
             " one: compute in __init__ what all episodes share"
         )
         return
-    if (count := INSTANCES - int(jnp.isfinite(first.obs).all(-1).sum())) > 0:
+    if (count := INSTANCES - int(told.pop("first").sum())) > 0:
         yield f"the observation of reset is not finite in {count} of {INSTANCES} episodes"
         return
-    drive = _compiled(jax.jit(functools.partial(_drive, env)).trace(first))
-    told: dict[str, np.ndarray] = jax.device_get(drive(first))
-    done, total = told.pop("done"), INSTANCES * STEPS
+    yield from _told_faults(told, rare)
+
+
+def _told_faults(told: dict[str, np.ndarray], rare: float) -> Iterator[str]:
+    """Say what is wrong in the results of `_drive`."""
+    flags, total = {name: told.pop(name) for name in ("done", SUCCESS)}, INSTANCES * STEPS
     for name, finite in told.items():
         count = total - int(finite.sum())
         if count > rare * total:
@@ -158,38 +177,104 @@ def _faults(env: AdaptedEnv, rare: float = _RARE) -> Iterator[str]:
                 f"{name} is not finite in {count:,} of {total:,} steps under random actions and"
                 " ±1: guard divisions, roots and logarithms"
             )
-    wrong = done[~np.isin(done, (0.0, 1.0))]
-    if wrong.size:
-        yield f"done is {wrong[0]:.4g} in a step: it should be 0 or 1"
-    elif done.all():
-        yield "done is 1 in every step: it should be 1 only where an episode ends"
+    for name, values in flags.items():
+        wrong = values[np.isfinite(values) & ~np.isin(values, (0.0, 1.0))]
+        if wrong.size:
+            yield f"{name} is {wrong[0]:.4g} in a step: it should be 0 or 1"
+    if (flags["done"] == 1.0).all():
+        yield (
+            "done is 1 in the first step of every episode: it should be 1 only where an episode"
+            " ends"
+        )
 
 
-def _compiled(traced: jax.stages.Traced) -> jax.stages.Compiled:
+def _timed(function: Callable[[Array], PyTree], keys: Array) -> tuple[Any, float]:
+    """Return what a function returns, on the host, and the seconds that it took once compiled."""
     options: Any = _QUICKLY if jax.default_backend() == "cpu" else None
-    return traced.lower().compile(options)
+    program = jax.jit(function).trace(keys).lower().compile(options)
+    begin = time.perf_counter()
+    result = jax.device_get(program(keys))
+    return result, time.perf_counter() - begin
 
 
-def _drive(env: AdaptedEnv, first: State) -> dict[str, Array]:
-    """Step all instances; return of each step whether its numbers are finite, and `done`."""
-    key = first_key()
+def _actions(env: AdaptedEnv) -> Float[Array, "steps instances action"]:
+    """Draw the actions of a drive; half of the instances get the largest ones."""
     shape = STEPS, INSTANCES, env.action_size
-    actions = jax.random.uniform(key, shape, minval=-1.0)
-    # Half of the instances get the largest actions.
+    actions = jax.random.uniform(first_key(), shape, minval=-1.0)
     extreme = (jnp.arange(INSTANCES) % 2 == 0)[:, None]
-    actions = jnp.where(extreme, jnp.sign(actions), actions)
+    return jnp.where(extreme, jnp.sign(actions), actions)
+
+
+def _drive(env: AdaptedEnv, keys: UInt32[Array, "instances 2"]) -> dict[str, Array]:
+    """Step all instances; tell of each step whether its numbers are finite, and the two flags.
+
+    `first` tells whether the observation of the reset is finite.
+    """
 
     def step_one(first: State, state: State, action: Array) -> tuple[State, dict[str, Array]]:
-        after = env.step(state, action)
-        shown = {"observation": after.obs, "reward": after.reward}
-        shown |= {f"metrics[{name!r}]": x for name, x in after.metrics.items()}
-        told = {name: jnp.isfinite(x).all() for name, x in shown.items()}
+        kept, shown = env.outcome(state, action)
+        told = {"observation": shown.obs, "reward": shown.reward}
+        told |= {f"metrics[{name!r}]": x for name, x in shown.metrics.items()}
+        told = {name: jnp.isfinite(x).all() for name, x in told.items()}
         # An episode that is over, or lost, begins again where it began.
-        over = (after.done != 0) | ~told["observation"]
+        over = (shown.done != 0) | ~told["observation"]
+        after = env.follow(state, kept, shown)
         following: PyTree = jax.tree.map(lambda a, b: jnp.where(over, a, b), first, after)
-        return following, told | {"done": after.done}
+        flags = {"done": shown.done, SUCCESS: shown.metrics.get(SUCCESS, jnp.zeros(()))}
+        return following, told | flags
+
+    first: PyTree = jax.vmap(env.reset)(keys)
 
     def step(states: State, action: Array) -> tuple[State, dict[str, Array]]:
         return jax.vmap(step_one)(first, states, action)
 
-    return jax.lax.scan(step, first, actions)[1]
+    told = jax.lax.scan(step, first, _actions(env))[1]
+    return told | {"first": jnp.isfinite(first.obs).all(-1)}
+
+
+_BATCHED_BY_USERS = {"custom_vmap_call", "ffi_call", "io_callback", "pure_callback"}
+"""Primitives that a batch computes as the user says."""
+
+
+def _unlike_alone(env: AdaptedEnv) -> Iterator[str]:
+    """Compare a reset and a step of a batch with those of single instances.
+
+    Args:
+      env: the environment.
+    """
+    if not any(_BATCHED_BY_USERS.intersection(_primitives(one.jaxpr)) for one in env.traced):
+        return
+
+    def reset(key: UInt32[Array, "2"]) -> dict[str, Array]:
+        state: PyTree = env.reset(key)
+        return {"obs": state.obs, **state.pipeline_state.kept}
+
+    def step(key: UInt32[Array, "2"], action: Float[Array, " action"]) -> dict[str, Array]:
+        kept, shown = env.outcome(env.reset(key), action)
+        return {"obs": shown.obs, "reward": shown.reward, "done": shown.done, **kept}
+
+    keys = jax.random.split(first_key(), INSTANCES)
+    for function, arguments in ((reset, (keys,)), (step, (keys, _actions(env)[0]))):
+        name, program = function.__name__, jax.jit(function)
+        try:
+            together = jax.device_get(jax.jit(jax.vmap(function))(*arguments))
+            alone = [jax.device_get(program(*one)) for one in zip(*arguments, strict=True)]
+        except Exception as error:
+            yield describe_error(error, f"a batch of {name}s", ())
+            return
+        for leaf, batch in together.items():
+            single = np.stack([one[leaf] for one in alone])
+            if not np.allclose(batch, single, rtol=1e-3, atol=1e-3, equal_nan=True):
+                yield (
+                    f"a {name} of {INSTANCES} instances gives another {leaf} than each of them"
+                    " alone: no instance may know of the others"
+                )
+                return
+
+
+def _primitives(jaxpr: Jaxpr) -> Iterator[str]:
+    """Return the names of all primitives of a trace."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for inner in jaxprs_in_params(equation.params):
+            yield from _primitives(inner)
