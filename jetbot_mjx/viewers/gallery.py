@@ -167,7 +167,7 @@ def _render_environment(
         total = sum(renderer.frame_count(one) for one in motions)
         _write_videos(files, [renderer.render_episode(one) for one in motions], total)
     note = (
-        f"{checkpoint.env_steps:>12,} steps  mean return {summary.episode_return:.1f} over"
+        f"{checkpoint.env_steps:>12,} steps  return {summary.episode_return:.1f} in the mean of"
         f" {episodes:,} episode{'s' if episodes > 1 else ''}"
     )
     return Rendered({}, episodes, files, note)

@@ -26,7 +26,7 @@ def test_episodes_are_rendered_in_real_time(folder, with_opengl):
         "video": "episodes-1.mp4",
         "gif": "episodes-1.gif",
     }
-    assert rendered.describe().splitlines()[0].endswith("over 1 episode")
+    assert rendered.describe().splitlines()[0].endswith("in the mean of 1 episode")
     frames = iio.imread(rendered.files["video"])
     seconds = 16 * point_mass.DT
     assert len(frames) == round(seconds * FPS) + round(HOLD_SECONDS * FPS) + 1 + FADE_FRAMES

@@ -176,7 +176,6 @@ def test_many_robots_and_a_strip_are_rendered(
         (["--strip", "--gallery"], "--strip: cannot be combined with --gallery"),
         (["--strip", "--goals", "3"], "--goals: cannot be combined with --strip"),
         (["--strip", "--episodes", "3"], "--episodes: cannot be combined with --strip"),
-        (["--strip", "--size", "64x64"], "--size: cannot be combined with --strip"),
         (["--strip", "--checkpoint", "last"], "--checkpoint: cannot be combined with --strip"),
     ],
 )
