@@ -393,6 +393,14 @@ def origin(text: str) -> str:
     return f"{parts.scheme}://{host}" + ("" if port in (None, default) else f":{port}")
 
 
+def open_page(path: Path) -> None:
+    """Open a file in the browser, or print that there is none."""
+    import webbrowser
+
+    if not webbrowser.open(path.resolve().as_uri()):
+        tell("no browser was found: open this file in one")
+
+
 def find_policy(name: str) -> Path:
     """Return the path of the run or checkpoint that an argument names, after all are parsed.
 

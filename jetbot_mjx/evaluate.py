@@ -65,13 +65,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             summarize_report,
         )
         from jetbot_mjx.runs import seed_folders
+        from jetbot_mjx.viewers import make_clips
     cli.prepare_device()
     with cli.trusting(trust), cli.show_progress():
         if len(runs) > 1 or seed_folders(runs[0]):
             result = compare_runs(runs, **options)
             text = summarize_comparison(result)
         else:
-            result = evaluate_run(runs[0], **options)
+            result = evaluate_run(runs[0], clips=make_clips, **options)
             text = summarize_report(result)
     cli.tell(text)
     below = below_target(result, target)

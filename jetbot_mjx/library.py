@@ -157,7 +157,7 @@ def evaluate(
                 f"{run} holds several seeds: name one of them, or compare all in a list, as in"
                 f" evaluate([{str(run)!r}])"
             )
-        return evaluation.evaluate_run(run, **options)
+        return evaluation.evaluate_run(run, clips=viewers.make_clips, **options)
 
 
 def render(

@@ -1,13 +1,37 @@
-"""List the runs in a folder, the latest first, and the names by which commands find them."""
+"""List the runs in a folder, the latest first, and the names by which commands find them.
 
+`--open latest` opens the report of a run in the browser, `--compare A B` shows what two runs differ
+in, and `--delete NAME` removes one after a question.
+"""
+
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from jetbot_mjx import cli, startup
+from jetbot_mjx import cli, errors, startup
+
+_SORTS = ("age", "name", "steps", "success")
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser(prog="jetbot-mjx runs", description=__doc__)
+    folder = "folder of the runs (default: runs)"
+    parser.add_argument("folder", type=Path, nargs="?", metavar="DIR", help=folder)
+    text = "list only runs whose name or task contains this text"
+    parser.add_argument("--filter", metavar="TEXT", default="", help=text)
+    cli.add_choice(parser, "--sort", _SORTS, "order of the list")
+    cli.add_flag(parser, "--json", "print the list as JSON")
+    action = parser.add_mutually_exclusive_group()
+    action.add_argument("--open", metavar="RUN", help="open the newest report of a run")
+    two = "show the settings and results in which two runs differ"
+    action.add_argument("--compare", nargs=2, metavar="RUN", help=two)
+    action.add_argument("--delete", metavar="RUN", help="delete a run, after a question")
+    cli.add_flag(parser, "--yes", "delete without a question")
+    return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line and list the runs.
+    """Parse the command line and list, open, compare or delete runs.
 
     Args:
       arguments: The arguments without the program's name, or None for those of the process.
@@ -15,24 +39,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    parser = cli.Parser(prog="jetbot-mjx runs", description=__doc__)
-    parser.add_argument(
-        "folder", type=Path, nargs="?", metavar="DIR", help="folder of the runs (default: runs)"
-    )
+    parser = _parser()
     options = parser.parse_args(arguments)
+    if options.yes and not options.delete:
+        parser.error("--yes: it belongs to --delete")
+    if options.folder and not options.folder.is_dir():
+        parser.error(f"{options.folder} is not a folder")
     with startup.exit_on_interrupt():
-        from jetbot_mjx.runs import PRETRAINED, ROOT, runs_table, scan_runs
+        from jetbot_mjx.runs import changes_table, compare_two, list_runs, newest_report
 
-    folder = options.folder or ROOT
-    if options.folder and not folder.is_dir():
-        parser.error(f"{folder} is not a folder")
-    cli.tell(runs_table(*scan_runs(folder)))
-    if not options.folder:
-        cli.tell(
-            "\nwith the package, for every command that takes a run:\n"
-            f"{runs_table(*scan_runs(PRETRAINED))}"
-        )
+    if options.open:
+        report = newest_report(cli.find_policy(options.open))
+        cli.tell(f"report: {report}")
+        cli.open_page(report)
+    elif options.compare:
+        cli.tell(changes_table(compare_two(*map(cli.find_policy, options.compare))))
+    elif options.delete:
+        _delete(options.delete, asks=not options.yes)
+    else:
+        how = {"text": options.filter, "sort": options.sort, "as_json": options.json}
+        cli.tell(list_runs(options.folder, **how))
     return 0
+
+
+def _delete(name: str, *, asks: bool) -> None:
+    """Delete a run, after a question.
+
+    Raises:
+      UserError: it is not a run of the user, a training writes it, or nobody can be asked.
+    """
+    from jetbot_mjx.runs import delete_run, find_deletable
+
+    run = find_deletable(cli.find_policy(name))
+    if asks:
+        if not sys.stdin.isatty():
+            raise errors.UserError(f"--delete {name}: nobody can be asked here: add --yes")
+        answer = input(f"delete {run.path}, {run.env_steps:,} steps of {run.task}? [y/N] ")
+        if answer.strip().lower() not in ("y", "yes"):
+            cli.tell("nothing was deleted")
+            return
+    delete_run(run)
+    cli.tell(f"deleted: {run.path}")
 
 
 if __name__ == "__main__":

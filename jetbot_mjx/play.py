@@ -24,6 +24,8 @@ def _parser() -> cli.Parser:
     cli.add_count(parser, "--seed", "random seed of the goals", least=0, default=0)
     web = "open a page that needs no server, in which another policy can be trained"
     parser.add_argument("--web", action="store_true", help=web)
+    text = "do not open the page"
+    parser.add_argument("--no-browser", dest="opens_page", action="store_false", help=text)
     # At most as many as two CPU cores still drive in real time.
     cli.add_count(parser, "--robots", "number of robots that drive at once", most=256, default=1)
     parser.add_argument(
@@ -74,15 +76,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _open_page(run: Path, which: Literal["best", "last"] | int, trust: bool) -> int:
     """Write the page of a run, and open it in the browser."""
     with startup.exit_on_interrupt():
-        import webbrowser
-
         from jetbot_mjx.deployment import summarize_web_page, write_web_page
     cli.prepare_device()
     with cli.trusting(trust), cli.show_progress():
         page = write_web_page(run, which=which)
     cli.tell(summarize_web_page(page))
-    if not webbrowser.open(page.path.resolve().as_uri()):
-        cli.tell("no browser was found: open this file in one")
+    cli.open_page(page.path)
     return 0
 
 

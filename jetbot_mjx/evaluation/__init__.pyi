@@ -1,4 +1,5 @@
 from .bootstrap_intervals import bootstrap as bootstrap
+from .clips import Clip as Clip
 from .comparison import Comparison as Comparison
 from .evaluate_runs import ReportOptions as ReportOptions
 from .evaluate_runs import Simulator as Simulator

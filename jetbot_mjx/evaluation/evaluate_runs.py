@@ -8,8 +8,9 @@ import jax
 
 from jetbot_mjx import runs
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
-from jetbot_mjx.envs import OTHER_NUMERICS, DomainRandomizationWrapper, Numerics
+from jetbot_mjx.envs import OTHER_NUMERICS, DomainRandomizationWrapper, JetBotEnv, Numerics
 from jetbot_mjx.errors import InvalidError, UserError
+from jetbot_mjx.evaluation.clips import ClipMaker, clip_goals
 from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compare
 from jetbot_mjx.evaluation.evaluate_returns import compare_return_runs, write_returns
 from jetbot_mjx.evaluation.evaluator import BASELINES, Evaluator, report_keys, summarize
@@ -22,6 +23,7 @@ from jetbot_mjx.evaluation.report import (
     compare_with_best_known,
     find_failures,
     learning_curve,
+    losses,
 )
 from jetbot_mjx.evaluation.result_names import find_report, name_with_count, report_folder
 from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
@@ -57,12 +59,16 @@ class ReportOptions(TypedDict, total=False):
 
 
 def evaluate_run(
-    run_or_checkpoint: str | Path, **options: Unpack[ReportOptions]
+    run_or_checkpoint: str | Path,
+    *,
+    clips: ClipMaker | None = None,
+    **options: Unpack[ReportOptions],
 ) -> Report | ReturnReport:
     """Evaluate one policy and write its report.
 
     Args:
       run_or_checkpoint: A run folder, or one of its checkpoint folders.
+      clips: A function that renders the report's clips; None: it has none.
       **options: What to evaluate, and where to write it.
 
     Returns:
@@ -78,7 +84,7 @@ def evaluate_run(
         _check_returns(checkpoint.config, options)
         return write_returns(checkpoint, reporter.episodes, reporter.output)
     check_writable(Path(reporter.output or checkpoint.results_dir / _FOLDER))
-    return reporter.write(checkpoint, checkpoint.make_setup(), reporter.output)
+    return reporter.write(checkpoint, checkpoint.make_setup(), reporter.output, clips=clips)
 
 
 def evaluate_in_mujoco(
@@ -329,6 +335,7 @@ class _Reporter:
         output: str | Path | None = None,
         *,
         again: bool = True,
+        clips: ClipMaker | None = None,
     ) -> Report:
         """Evaluate a policy and write its report.
 
@@ -337,6 +344,7 @@ class _Reporter:
           setup: its environment, networks and programs.
           output: the folder of the report; None: the one that `report_folder` chooses.
           again: whether to write a report also where there is one that is at least as full.
+          clips: as for `evaluate_run`.
         """
         config, ranges = checkpoint.config, self._ranges or checkpoint.config.randomization
         env = setup.robot_env
@@ -361,11 +369,13 @@ class _Reporter:
             goal_bins=by_goal(finished, env.dt),
             failures=find_failures(finished, run_dir, checkpoint.env_steps),
             learning_curve=learning_curve((one.env_steps, one.metrics) for one in history),
+            losses=losses((one.env_steps, one.metrics) for one in history),
             episodes=finished,
             versions=self._versions,
             fallbacks=checkpoint.about.get("fallbacks", ()),
             ranges=ranges if ranges.drawn else None,
             ranges_file=None if self._ranges_file is None else Path(self._ranges_file),
+            changes=runs.changes_since_the_run_before(checkpoint.run_dir),
             best_known=best_known,
             best_known_missing=missing,
             seen=self._moments.find(checkpoint.params, self._keys, finished)
@@ -374,6 +384,18 @@ class _Reporter:
             **self._on_other_robots(checkpoint, setup),
         )
         if fuller is None:
+            if clips is not None:
+                report = _with_clips(report, env, clips)
             with stage("writing the report"):
                 write_report(report)
         return report
+
+
+def _with_clips(report: Report, env: JetBotEnv, make: ClipMaker) -> Report:
+    """Return a report with clips, or with the reason why this machine cannot render them."""
+    goals = clip_goals(report.episodes)
+    try:
+        with stage("clips"):
+            return report._replace(clips=tuple(make(env, report.episodes, goals)))
+    except UserError as error:
+        return report._replace(clips_missing=str(error))

@@ -28,7 +28,7 @@ LISTED_FAILURES = 50
 _MAX_REPLAYED = 8
 
 _OPTIONAL_FIGURES = {
-    "report": {"learning_curve", "robustness", "seen"},
+    "report": {"learning_curve", "losses", "robustness", "seen"},
     "comparison": {"learning_curves"},
     "return_report": {"learning_curve"},
     "return_comparison": {"learning_curves"},
@@ -74,6 +74,8 @@ def write_report(report: Report) -> Path:
     }
     if report.learning_curve:
         figures["learning_curve"] = lambda: learning_curves.plot_learning_curve(report)
+    if report.losses:
+        figures["losses"] = lambda: learning_curves.plot_losses(report)
     if report.robustness:
         figures["robustness"] = lambda: plots.plot_robustness(report.robustness)
     if report.seen:
@@ -91,6 +93,7 @@ def write_report(report: Report) -> Path:
             "replay": replay_command(report.run, report.env_steps, goals),
             "replayed": len(goals),
             "evaluate_command": report.evaluate_command(),
+            "clips": [(clip, _data_uri(clip.mp4, "video/mp4")) for clip in report.clips],
         },
     )
 
@@ -205,8 +208,8 @@ def _draw(draw: Callable[[], Figure]) -> dict[str, bytes]:
     return pngs
 
 
-def _data_uri(png: bytes) -> str:
-    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
+def _data_uri(content: bytes, kind: str = "image/png") -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _numbers(values: JsonObject, suffix: str) -> Callable[[str, str], str]:

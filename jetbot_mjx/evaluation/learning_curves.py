@@ -35,6 +35,28 @@ def plot_learning_curve(report: Report) -> Figure:
     return figure
 
 
+def plot_losses(report: Report) -> Figure:
+    """Plot the losses over the training.
+
+    Args:
+      report: the report of one policy, whose run has losses.
+
+    Returns:
+      The figure, a panel for each of them.
+    """
+    figure = Figure(figsize=(10.4, 2.6), layout="constrained")
+    steps = [point.env_steps for point in report.losses]
+    titles = ("Policy loss", "Value loss", "KL divergence per update")
+    values = zip(*(point[1:] for point in report.losses), strict=True)
+    for axes, title, line in zip(figure.subplots(1, 3), titles, values, strict=True):
+        axes.plot(steps, line, color="C0", lw=1.5)
+        axes.set(title=title, xlabel="environment steps")
+        axes.xaxis.set_major_formatter(EngFormatter())
+        axes.grid()
+        axes.set_axisbelow(True)
+    return figure
+
+
 def plot_learning_curves(comparison: Comparison) -> Figure:
     """Plot the success rate over the training of every run, with a band.
 

@@ -15,12 +15,13 @@ from jaxtyping import Float, Int
 
 from jetbot_mjx.config import Config, RandomizationConfig
 from jetbot_mjx.evaluation import best_known
+from jetbot_mjx.evaluation.clips import Clip
 from jetbot_mjx.evaluation.evaluator import Summary, final_distances, json_values, success_and_time
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
 from jetbot_mjx.evaluation.moments import SeenEpisode, moments_as_json
 from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
 from jetbot_mjx.evaluation.rollout import Episodes
-from jetbot_mjx.runs import JsonObject, MetricValues, shortened
+from jetbot_mjx.runs import JsonObject, MetricValues, RunChanges, shortened
 
 TIME_LIMIT = "time limit"
 ENDED_BY_TASK = "ended by the task"
@@ -92,6 +93,16 @@ class CurvePoint(NamedTuple):
     """[s] Median over the successes; None without a success, and in a curve over several seeds."""
 
 
+class LossPoint(NamedTuple):
+    """A `LossPoint` holds the losses of one line of the training's metrics."""
+
+    env_steps: int
+    policy: float
+    value: float
+    kl: float
+    """Kullback-Leibler divergence of the policy from the one that collected the data."""
+
+
 class TimeGap(NamedTuple):
     """A `TimeGap` compares a policy's time with the best-known time over the goals it reached."""
 
@@ -156,6 +167,14 @@ class Report(NamedTuple):
     """Why there are no best-known times."""
     seen: tuple[SeenEpisode, ...] = ()
     """The images that the policy saw in some episodes; empty if it does not see."""
+    clips: tuple[Clip, ...] = ()
+    """Videos of some episodes; empty if none were requested, or none could be rendered."""
+    clips_missing: str | None = None
+    """Why no clips could be rendered."""
+    changes: RunChanges | None = None
+    """What the run changed from the one before it in the same folder; None without one."""
+    losses: tuple[LossPoint, ...] = ()
+    """Losses during the training; empty if the run folder holds none."""
 
     def __repr__(self) -> str:
         """Return the headline and the folder in one line."""
@@ -201,6 +220,7 @@ class Report(NamedTuple):
             "robustness": as_json(self.robustness) if self.robustness else None,
             "ranges": self.ranges.drawn if self.ranges else None,
             "seen": moments_as_json(self.seen) if self.seen else None,
+            "clips": [{"goal": clip.goal, "reached": clip.reached} for clip in self.clips],
         }
         return json_values({"goal_set_version": GOAL_SET_VERSION, **fields, **converted})
 
@@ -353,3 +373,14 @@ def learning_curve(history: Iterable[tuple[int, MetricValues]]) -> tuple[CurvePo
         if rate is not None and low is not None and high is not None:
             points.append(CurvePoint(env_steps, rate, low, high, seconds))
     return tuple(sorted(points, key=lambda point: point.env_steps))
+
+
+def losses(history: Iterable[tuple[int, MetricValues]]) -> tuple[LossPoint, ...]:
+    """Extract the losses from the metrics of a training, as `learning_curve` does."""
+    points = []
+    for env_steps, metrics in history:
+        names = ("loss/policy", "loss/value", "policy/kl")
+        policy, value, kl = (metrics.get(name) for name in names)
+        if policy is not None and value is not None and kl is not None:
+            points.append(LossPoint(env_steps, policy, value, kl))
+    return tuple(points)

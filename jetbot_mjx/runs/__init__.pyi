@@ -29,6 +29,14 @@ from .nan_dump import save_nan_dump as save_nan_dump
 from .resumption import Resumption as Resumption
 from .resumption import resume as resume
 from .resumption import to_trees as to_trees
+from .run_changes import RunChanges as RunChanges
+from .run_changes import changes_since_the_run_before as changes_since_the_run_before
+from .run_changes import changes_table as changes_table
+from .run_changes import compare_two as compare_two
+from .run_changes import delete_run as delete_run
+from .run_changes import find_deletable as find_deletable
+from .run_changes import list_runs as list_runs
+from .run_changes import newest_report as newest_report
 from .run_dir import JsonObject as JsonObject
 from .run_dir import atomic_folder as atomic_folder
 from .run_dir import changed_versions as changed_versions
@@ -54,8 +62,6 @@ from .run_finder import copy_pretrained as copy_pretrained
 from .run_finder import explain_missing as explain_missing
 from .run_finder import find_run as find_run
 from .run_finder import find_run_config as find_run_config
-from .run_finder import runs_table as runs_table
-from .run_finder import scan_runs as scan_runs
 from .setup import Setup as Setup
 from .task_code import TaskCode as TaskCode
 from .task_code import collect_task_code as collect_task_code

@@ -287,7 +287,7 @@ def check_writable(path: Path) -> None:
     Nothing is created.
 
     Raises:
-      UserError: the path or a part of it is no folder, or may not be written.
+      UserError: the path or a part of it is not a folder, or may not be written.
     """
     with writing_to(path):
         existing = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())

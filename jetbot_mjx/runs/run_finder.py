@@ -19,6 +19,7 @@ from jetbot_mjx.runs.metrics import METRICS, read_history
 from jetbot_mjx.runs.run_dir import (
     CONFIG,
     DamagedRunError,
+    JsonObject,
     atomic_folder,
     read_config,
     shortened,
@@ -57,6 +58,10 @@ class RunInfo(NamedTuple):
     def name(self) -> str:
         """Return the shortest name by which commands find the run."""
         return _shortest_name(self.path)
+
+    def to_json(self) -> JsonObject:
+        """Return the name and all fields as JSON values."""
+        return {"name": self.name, **self._asdict(), "path": str(self.path)}
 
 
 def _shortest_name(path: Path) -> str:
@@ -183,7 +188,7 @@ def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRunError] = ())
             run.name,
             run.task,
             f"{run.env_steps:,}" + (" *" if run.env_steps < run.num_timesteps else ""),
-            _score(run),
+            format_score(run),
             _age(time.time() - run.changed),
         )
         for run in runs
@@ -197,7 +202,7 @@ def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRunError] = ())
     return "\n".join(lines)
 
 
-def _score(run: RunInfo) -> str:
+def format_score(run: RunInfo) -> str:
     """Return the success rate of a run, or its return where it has none."""
     if run.success_rate is not None:
         return f"{run.success_rate:.1%}"

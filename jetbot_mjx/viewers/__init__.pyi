@@ -1,3 +1,4 @@
+from .clips import make_clips as make_clips
 from .environment_video import EnvironmentVideo as EnvironmentVideo
 from .gallery import GALLERY_EPISODES as GALLERY_EPISODES
 from .gallery import Rendered as Rendered

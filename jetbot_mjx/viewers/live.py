@@ -2,7 +2,10 @@
 
 import contextlib
 import getpass
+import os
 import socket
+import sys
+import webbrowser
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
@@ -24,6 +27,7 @@ def play_live(
     host: str = "127.0.0.1",
     port: int | None = None,
     allow: Sequence[str] = (),
+    opens_page: bool = True,
     tell: Callable[[str], None],
 ) -> tuple[int, int]:
     """Drive and show a policy in real time until the user interrupts or closes the window.
@@ -38,6 +42,7 @@ def play_live(
       host: The address that the page is served at.
       port: The port that the page is served at, or None for the first free one from 8080 on.
       allow: Origins of other pages that may connect, such as `https://hub.example.org`.
+      opens_page: Whether to open the page, where there is a display.
       tell: A function that receives messages for the user, line by line.
 
     Returns:
@@ -59,6 +64,8 @@ def play_live(
             with viser_server.ViserViewer(player, host, free, allow=allow, tell=tell) as page:
                 for line in addresses(host, free):
                     tell(line)
+                if opens_page and has_display():
+                    webbrowser.open(f"http://{local_name(host)}:{free}")
                 page.run()
     else:
         mujoco_window.require_window()
@@ -69,6 +76,19 @@ def play_live(
     with contextlib.suppress(KeyboardInterrupt):
         run(player)
     return player.successes, player.episodes
+
+
+def has_display() -> bool:
+    """Return whether a browser that this process opens would be seen by its user."""
+    names = ("DISPLAY", "WAYLAND_DISPLAY")
+    seen = sys.platform != "linux" or any(map(os.environ.get, names))
+    return seen and "SSH_CONNECTION" not in os.environ
+
+
+def local_name(host: str) -> str:
+    """Return the name by which this machine reaches an address that it listens on."""
+    here = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}
+    return here.get(host, f"[{host}]" if ":" in host else host)
 
 
 def addresses(host: str, port: int) -> list[str]:
@@ -82,7 +102,7 @@ def addresses(host: str, port: int) -> list[str]:
       Lines for the terminal.
     """
     everywhere = host in ("0.0.0.0", "::")
-    here = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+    here = local_name(host)
     name = socket.gethostname()
     # In a container the user may have no name.
     with contextlib.suppress(KeyError, OSError):

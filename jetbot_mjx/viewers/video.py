@@ -161,18 +161,21 @@ class VideoRenderer(contextlib.ExitStack):
         self._view = self.enter_context(Renderer(model, width=size[0], height=size[1]))
         self._inset = self.enter_context(Renderer(model, width=width, height=height))
 
-    def render_episode(self, trajectory: Trajectory) -> Iterator[Frame]:
+    def render_episode(self, trajectory: Trajectory, speed: int = 1) -> Iterator[Frame]:
         """Render one episode, as `render_side_by_side` does.
 
         Args:
           trajectory: the episode.
+          speed: the pace, as a multiple of real time.
 
         Returns:
           Frames, one view wide.
         """
-        return self.render_side_by_side([("", trajectory)])
+        return self.render_side_by_side([("", trajectory)], speed)
 
-    def render_side_by_side(self, episodes: Sequence[tuple[str, Trajectory]]) -> Iterator[Frame]:
+    def render_side_by_side(
+        self, episodes: Sequence[tuple[str, Trajectory]], speed: int = 1
+    ) -> Iterator[Frame]:
         """Render several episodes side by side in the same time; finished robots stand still.
 
         All views have the same fixed camera behind the start, which sees all paths and goals
@@ -181,6 +184,7 @@ class VideoRenderer(contextlib.ExitStack):
 
         Args:
           episodes: a heading and a trajectory for each view, from left to right.
+          speed: the pace, as a multiple of real time.
 
         Returns:
           Frames, one view wide per episode.
@@ -192,8 +196,8 @@ class VideoRenderer(contextlib.ExitStack):
             functools.lru_cache(1)(functools.partial(self._episode_view, *one, camera))
             for one in episodes
         ]
-        for frame in range(self.frame_count(trajectories)):
-            steps = [trajectory.step_at(frame / self._fps) for trajectory in trajectories]
+        for frame in range(self.frame_count(trajectories, speed)):
+            steps = [trajectory.step_at(speed * frame / self._fps) for trajectory in trajectories]
             views = [draw(step) for draw, step in zip(draws, steps, strict=True)]
             # A white line between neighbouring views.
             yield np.hstack([*map(_with_white_border, views[:-1]), views[-1]])
@@ -204,10 +208,10 @@ class VideoRenderer(contextlib.ExitStack):
         filled = _FILLED | {"sides": _FILLED["sides"] * width / height}
         return overview(np.vstack([*map(_extent, trajectories)]), self._fovy, **filled)
 
-    def frame_count(self, trajectories: Sequence[Trajectory]) -> int:
+    def frame_count(self, trajectories: Sequence[Trajectory], speed: int = 1) -> int:
         """Return the number of frames of a video of one trajectory, or of several side by side."""
         longest = max(trajectory.steps * trajectory.dt for trajectory in trajectories)
-        return math.ceil(longest * self._fps) + round(HOLD_SECONDS * self._fps) + 1
+        return math.ceil(longest * self._fps / speed) + round(HOLD_SECONDS * self._fps) + 1
 
     def _episode_view(
         self, heading: str, trajectory: Trajectory, camera: mujoco.MjvCamera, step: int
@@ -384,12 +388,17 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float = FPS) -> None:
       fps: frames per second.
     """
     # Encode in memory, so that a full disk leaves no partial file.
+    write_bytes(path, encode_mp4(frames, fps))
+
+
+def encode_mp4(frames: Iterable[Frame], fps: float) -> bytes:
+    """Return a video as `write_mp4` writes it."""
     file = io.BytesIO()
     with iio.imopen(file, "w", plugin="pyav", extension=".mp4") as video:
         video.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")
         for frame in frames:
             video.write_frame(frame)
-    write_bytes(path, file.getvalue())
+    return file.getvalue()
 
 
 def write_gif(path: Path, frames: Sequence[Frame]) -> None:

@@ -21,6 +21,7 @@ from trimesh.visual.material import PBRMaterial
 from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.runs import JsonObject
 from jetbot_mjx.viewers.meshes import Geom, visible_geoms
+from jetbot_mjx.viewers.offscreen import METRE_LABELS
 from jetbot_mjx.viewers.player import Player
 from jetbot_mjx.viewers.pose import set_pose
 from jetbot_mjx.viewers.viser_camera import Cameras
@@ -30,7 +31,7 @@ FPS = 30
 
 _FLOOR_PER_REACH = 2.5  # from the outermost cells to the floor's edge, per largest goal distance
 _CELL_PER_REACH = 1.0  # distance between neighbouring robots' cells
-_CELL, _SECTION = 0.25, 0.5  # [m] spacing of the thin and thick lines on the floor
+_CELL, _SECTION = 0.25, 1.0  # [m] spacing of the thin and thick lines on the floor
 _LINES = (
     ("thin", _CELL, 0.003, (165, 170, 176)),
     ("thick", _SECTION, 0.006, (125, 131, 139)),
@@ -38,6 +39,8 @@ _LINES = (
 _FEW_ROBOTS = 9  # robots up to which round parts are drawn finely, and lines thinly
 _SECTIONS, _COARSE_SECTIONS = 48, 12  # faces around a round part
 _COARSE_LINES = 2  # factor on spacing and width of lines
+
+_LABEL_RGB, _LABEL_WIDTH = (110, 118, 128), 0.006  # of the metres on the floor; width in [m]
 
 _TRAIL_POINTS = 40  # of one robot
 _TRAIL_PER_REACH = 2.0  # length of a trail, relative to the largest goal distance
@@ -233,6 +236,10 @@ class Scene:
         self._lines = scene.add_glb(
             "/lines", _lines(self._edge, self._lines_scale), cast_shadow=False, receive_shadow=False
         )
+        if self._player.robots == 1:
+            strokes = [np.stack([line[:-1], line[1:]], axis=1) for line in METRE_LABELS]
+            labels_w = np.concatenate(strokes)
+            scene.add_line_segments("/metres", labels_w, _LABEL_RGB, thickness=_LABEL_WIDTH)
         # viser's default lights cast shadows and reflect; without a GPU, that gives two frames per
         # second.
         scene.configure_environment_map(None)

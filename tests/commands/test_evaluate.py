@@ -31,7 +31,8 @@ from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 
 EPISODES = 48
-FIGURES = {"by_goal.png", "trajectories.png", "distributions.png", "learning_curve.png"}
+CURVES = {"learning_curve.png", "losses.png"}
+FIGURES = {"by_goal.png", "trajectories.png", "distributions.png"} | CURVES
 PAGES = {"report.html", "report.md", "report.json"}
 
 
@@ -162,8 +163,11 @@ def test_the_page_tells_the_numbers_of_the_json_file(judged):
 def test_a_page_loads_nothing(judged):
     _, folder, _, _ = judged
     page = Numbers((folder / "report.html").read_text("utf-8"))
-    assert len(page.loaded) == 2 * len(FIGURES)
-    assert all(one.startswith("data:image/png;base64,") for one in page.loaded)
+    images = [one for one in page.loaded if one.startswith("data:image/png;base64,")]
+    clips = [one for one in page.loaded if one.startswith("data:video/mp4;base64,")]
+    assert len(images) == 2 * len(FIGURES)
+    assert len(images) + len(clips) == len(page.loaded)
+    assert sum(map(len, clips)) < 3_000_000
     assert "script" not in page.tags
     assert "url(" not in (folder / "report.html").read_text("utf-8")
 
@@ -342,7 +346,7 @@ def test_a_policy_that_reaches_nothing_gets_its_report(hopeless, still):
     page = (hopeless.folder / "report.html").read_text("utf-8")
     assert "--goals 0,1,2,3,4,5,6,7</code>" in page
     assert "holds no evaluations of the training" in page
-    assert set(files(hopeless.folder)) == PAGES | FIGURES - {"learning_curve.png"}
+    assert set(files(hopeless.folder)) == PAGES | FIGURES - CURVES
 
 
 @pytest.mark.usefixtures("blank_figures")

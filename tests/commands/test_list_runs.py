@@ -1,9 +1,16 @@
 """The command that lists runs."""
 
+import json
+import os
+import time
+import webbrowser
+from pathlib import Path
+
 import pytest
 
 from helpers.run_folders import make_run
 from jetbot_mjx import list_runs
+from jetbot_mjx.errors import UserError
 
 
 @pytest.fixture
@@ -26,3 +33,75 @@ def test_the_command_refuses_what_is_no_folder(capsys):
         list_runs.main(["nowhere"])
     assert left.value.code == 2
     assert "nowhere is not a folder" in capsys.readouterr().err
+
+
+def test_the_list_is_filtered_sorted_and_printed_as_json(runs, capsys):
+    assert list_runs.main(["runs", "--sort", "name", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [(run["name"], run["success_rate"]) for run in found] == [("newer", 0.2), ("older", 0.1)]
+    assert list_runs.main(["--filter", "OLD"]) == 0
+    out = capsys.readouterr().out
+    assert "older" in out
+    assert "newer" not in out
+    assert list_runs.main(["runs", "--sort", "success"]) == 0
+    out = capsys.readouterr().out
+    assert out.index("newer") < out.index("older")
+
+
+def test_the_newest_report_is_opened(runs, monkeypatch, capsys):
+    with pytest.raises(UserError, match="has no report: write one with `jetbot-mjx evaluate"):
+        list_runs.main(["--open", "latest"])
+    opened = []
+    monkeypatch.setattr(webbrowser, "open", lambda url: bool(opened.append(url)))
+    for age, name in ((5, "000000000010"), (2, "000000000005")):
+        page = Path("runs/newer/evaluations", name, "report.html")
+        page.parent.mkdir(parents=True)
+        page.write_text("")
+        os.utime(page, (time.time() - age,) * 2)
+    assert list_runs.main(["--open", "latest"]) == 0
+    assert opened == [page.resolve().as_uri()]
+    assert "no browser was found" in capsys.readouterr().out
+
+
+def test_two_runs_are_compared_by_name(runs, capsys):
+    assert list_runs.main(["--compare", "older", "newer"]) == 0
+    out = capsys.readouterr().out
+    assert "10.0%" in out
+    assert "20.0%" in out
+    assert "all settings are equal" in out
+
+
+def test_a_run_is_deleted_after_a_question(runs, monkeypatch, capsys):
+    with pytest.raises(UserError, match="nobody can be asked here: add --yes"):
+        list_runs.main(["--delete", "older"])
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    questions = []
+    for answer in ("", "n"):
+        monkeypatch.setattr("builtins.input", lambda text, a=answer: questions.append(text) or a)
+        assert list_runs.main(["--delete", "older"]) == 0
+        assert capsys.readouterr().out == "nothing was deleted\n"
+    assert questions[0].startswith("delete runs/older, 0 steps of ")
+    assert Path("runs/older").is_dir()
+    assert list_runs.main(["--delete", "older", "--yes"]) == 0
+    assert not Path("runs/older").exists()
+    assert Path("runs/newer").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--delete", "pretrained:jetbot_egocentric"], "it comes with the package and stays"),
+        (["--delete", "runs"], "--delete runs: there is no run in this folder"),
+    ],
+)
+def test_only_a_run_of_the_user_is_deleted(runs, arguments, said):
+    with pytest.raises(UserError, match=said):
+        list_runs.main([*arguments, "--yes"])
+    assert Path("runs/older").is_dir()
+
+
+def test_yes_alone_is_refused(capsys):
+    with pytest.raises(SystemExit) as left:
+        list_runs.main(["--yes"])
+    assert left.value.code == 2
+    assert "--yes: it belongs to --delete" in capsys.readouterr().err

@@ -27,7 +27,7 @@ def nothing_loads(monkeypatch):
     monkeypatch.setattr(live, "Player", load)
 
 
-def test_the_page_is_served_until_ctrl_c(smoke_run, capfd, unused_port):
+def test_the_page_is_served_until_ctrl_c(smoke_run, capfd, unused_port, monkeypatch):
     free_port = pytest.importorskip("jetbot_mjx.viewers.viser_server").free_port
     port = unused_port()
     pages = []
@@ -44,9 +44,13 @@ def test_the_page_is_served_until_ctrl_c(smoke_run, capfd, unused_port):
         time.sleep(1.0)
         os.kill(os.getpid(), signal.SIGINT)
 
+    opened = []
+    monkeypatch.setattr(live, "has_display", lambda: True)
+    monkeypatch.setattr(live.webbrowser, "open", opened.append)
     threading.Thread(target=look_and_interrupt, daemon=True).start()
     assert play.main([str(smoke_run), "--port", str(port), "--agent", "scripted"]) == 0
     assert pages == [200]
+    assert opened == [f"http://127.0.0.1:{port}"]
     told, complaints = capfd.readouterr()
     assert complaints == ""
     loading, first, second, last = told.splitlines()
@@ -74,6 +78,19 @@ def test_the_address_is_one_to_open_and_a_warning_where_all_may(host, here, line
     assert f"-L 8080:{here}:8080 " in told[1]
     assert len(told) == lines
     assert ("everyone" in told[-1]) == (lines == 3)
+
+
+@pytest.mark.parametrize(
+    ("environment", "seen"),
+    [({"DISPLAY": ":0"}, True), ({}, False), ({"DISPLAY": ":0", "SSH_CONNECTION": "a b"}, False)],
+)
+def test_a_browser_opens_only_where_its_user_sees_it(monkeypatch, environment, seen):
+    monkeypatch.setattr(sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SSH_CONNECTION"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert live.has_display() == seen
 
 
 def test_a_user_without_a_name_is_left_out(monkeypatch):

@@ -698,7 +698,7 @@ class App {
   setPaused(paused) {
     this.simulation.paused = paused;
     byId("pause").setAttribute("aria-pressed", paused);
-    byId("pause").setAttribute("aria-label", paused ? "Go on" : "Pause");
+    byId("pause").setAttribute("aria-label", paused ? "Resume" : "Pause");
     byId("pause-mark").setAttribute("d", paused ? "M7 4l9 6-9 6z" : "M7 4v12M13 4v12");
   }
 
