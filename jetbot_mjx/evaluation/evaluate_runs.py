@@ -384,8 +384,7 @@ class _Reporter:
             **self._on_other_robots(checkpoint, setup),
         )
         if fuller is None:
-            if clips is not None:
-                report = _with_clips(report, env, clips)
+            report = report if clips is None else _with_clips(report, env, clips)
             with stage("writing the report"):
                 write_report(report)
         return report
