@@ -1,6 +1,6 @@
 """Copy the trained policies that come with the package: `jetbot-mjx pretrained`.
 
-There is one run for each of four configurations. The copies are run folders like any other:
+There is one run for each of six configurations. The copies are run folders like any other:
 evaluate them, render them, compare them with your own runs, or train them further.
 """
 

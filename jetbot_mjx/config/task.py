@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from jetbot_mjx.config.section import Section
-from jetbot_mjx.config.value_types import Count, Positive, Scalar, Text
+from jetbot_mjx.config.value_types import Count, NonNegative, Positive, Scalar, Text
 
 
 class TaskConfig(Section):
@@ -33,6 +33,9 @@ class TaskConfig(Section):
     success_radius: Annotated[float, Field(ge=0.02, allow_inf_nan=False)] = 0.1
     """[m] 3-D distance of the axle midpoint to the goal below which it is reached. The cube's
     centre lies 18 mm above the axle: no smaller radius can be reached."""
+    step_cost: NonNegative = 0.0
+    """[m] cost of each step, subtracted from the progress, which is at most `max_speed * ctrl_dt`.
+    Without one only the discount makes a policy hurry."""
     options: dict[Text, Scalar] = Field(default_factory=dict)
     """Free settings for a task of your own."""
 

@@ -21,7 +21,14 @@ from jetbot_mjx.deployment.web_functions import web_functions
 from jetbot_mjx.envs import make_jetbot_env
 from onekernel.build import wasm
 
-_POLICIES = ("jetbot_egocentric", "jetbot_camera", "real_jetbot", "camera_real")
+_POLICIES = (
+    "best",
+    "best_egocentric",
+    "jetbot_egocentric",
+    "jetbot_camera",
+    "real_jetbot",
+    "camera_real",
+)
 SHIPPED = ("jetbot", *_POLICIES, *(f"pretrained:{name}" for name in _POLICIES))
 """Configurations and policies whose modules are stored. Their settings differ where a configuration
 was changed after the training."""

@@ -241,7 +241,8 @@ class GoalTask:
 
     Goals: the distance is r = span·√u + minimum, and the direction is uniform. Adding the minimum
     makes near goals rarer than a uniform draw over the ring would; the tutorial samples so.
-    Reward: the progress d(t-1) - d(t), so that the return is the distance covered towards the goal.
+    Reward: the progress d(t-1) - d(t), so that the return is the distance covered towards the goal,
+    less `step_cost`, which the tutorial has not.
     Success and termination: the 3-D distance from the axle midpoint to the cube's centre is below
     `success_radius`. Since the centre lies 18 mm higher, that is 98.4 mm on the floor.
 
@@ -291,9 +292,13 @@ class GoalTask:
     def reward(
         self, before: RobotState, after: RobotState, goal: Goal, action: Float[Array, " action"]
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
-        """Return the progress towards the goal in this step [m], d(t-1) - d(t)."""
+        """Return the progress towards the goal in this step [m], d(t-1) - d(t), less its cost."""
         progress = self.distance(before, goal) - self.distance(after, goal)
-        return progress, {"progress": progress}
+        cost = self.config.step_cost
+        # Without a cost the program stays what it is.
+        if not cost:
+            return progress, {"progress": progress}
+        return progress - cost, {"progress": progress, "step_cost": jnp.full_like(progress, -cost)}
 
     def terminated(self, robot: RobotState, goal: Goal) -> Bool[Array, ""]:
         """Return whether the robot has reached the goal; nothing else ends an episode."""

@@ -15,12 +15,12 @@ from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
 from jetbot_mjx.runs import copy_pretrained
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 
-NAMES = ("camera_real", "jetbot_camera", "jetbot_egocentric", "real_jetbot")
+NAMES = ("best", "best_egocentric", "camera_real", "jetbot_camera", "jetbot_egocentric", "real_jetbot")
 CHANGED = {"jetbot_egocentric": {"ppo.num_timesteps": 2_621_440}}
 """What a run that comes with the package changes of its configuration."""
 
 THEN = {"physics.ls_iterations": 4}
-"""Defaults that were others when these policies were trained."""
+"""Defaults that were others when the policies before `best` were trained."""
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def runs(tmp_path, monkeypatch):
     return copy_pretrained(pretrained.FOLDER)
 
 
-def test_there_is_a_run_for_each_of_four_configurations(runs):
+def test_there_is_a_run_for_each_of_six_configurations(runs):
     assert runs == tuple(Path("runs/pretrained") / name for name in NAMES)
 
 
