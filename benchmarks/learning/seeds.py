@@ -135,7 +135,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             label = " ".join(filter(None, (Path(base).stem, name)))
             results[label] = measure(config, options.fresh)
             print(table({label: results[label]}).splitlines()[-1], flush=True)
-            about = {"device": jax.devices()[0].device_kind, "processor": processor(), "versions": versions()}
+            about = {
+                "device": jax.devices()[0].device_kind,
+                "processor": processor(),
+                "versions": versions(),
+            }
             write_json(options.output, {**about, "configurations": results})
     print(table(results))
     return 0

@@ -130,6 +130,15 @@ def test_reward_is_progress_and_telescopes():
     np.testing.assert_allclose(sum(rewards), covered, rtol=1e-5)
 
 
+def test_a_step_costs_what_is_stated_and_nothing_by_default():
+    way = robot_at(0.0), robot_at(0.1), goal_at(1.0, 0.0), jnp.zeros(2)
+    free, terms = GoalTask(TaskConfig()).reward(*way)
+    assert set(terms) == {"progress"}
+    dear, terms = GoalTask(TaskConfig(step_cost=0.03)).reward(*way)
+    np.testing.assert_allclose(free - dear, 0.03, rtol=1e-4)
+    np.testing.assert_allclose(sum(terms.values()), dear, rtol=1e-6)
+
+
 @pytest.mark.parametrize(("gap", "reached"), [(0.0983, True), (0.0986, False)])
 def test_success_is_a_ball_of_100_mm_hence_98_mm_on_the_floor(gap, reached):
     # √(0.1² - (0.05 - 0.0325)²) = 0.09846

@@ -21,7 +21,7 @@ from benchmarks import RESULTS, ROOT, steps_per_second
 from benchmarks.harness import processes, readme_table, results, timing
 from benchmarks.harness.measurements import Sizes
 from benchmarks.harness.timing import make_row
-from benchmarks.learning import randomization
+from benchmarks.learning import randomization, seeds
 from benchmarks.reliability import regressions, robot_fidelity
 from benchmarks.throughput import (
     adapters,
@@ -182,6 +182,29 @@ def test_the_tables_in_the_documentation_are_up_to_date():
         assert readme_table.with_tables(text, name, measured) == text, (
             "run python benchmarks/harness/readme_table.py"
         )
+
+
+def test_the_table_of_seeds_holds_the_median_and_the_worst():
+    def one(success, gap):
+        return {"success_rate": success, "fresh_success_rate": success, "above_best_known": gap}
+
+    known = {"training_seconds": 9.0, "seeds": [one(1.0, 0.01), one(0.9, 0.03), one(1.0, 0.02)]}
+    unknown = {"training_seconds": 9.0, "seeds": [one(1.0, "no search was made")]}
+    rows = seeds.table({"known": known, "unknown": unknown}).splitlines()[2:]
+    assert rows == [
+        "| known | 3 | 9 s | 100.00% (90.00%) | 100.000% (90.000%) | +2.00% (+3.00%) |",
+        "| unknown | 1 | 9 s | 100.00% (100.00%) | 100.000% (100.000%) | - |",
+    ]
+
+
+def test_the_variants_of_a_benchmark_are_valid_settings(tmp_path):
+    variants = seeds.variants_of(ROOT / "benchmarks/learning/best_variants.yaml")
+    for base, changed in itertools.product(("best", "best_egocentric"), variants.values()):
+        load_config(base, changed)
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text("name: 3\n")
+    with pytest.raises(UserError, match="should hold a mapping of changed settings"):
+        seeds.variants_of(wrong)
 
 
 def test_the_table_holds_the_median_time_and_the_worst_success_of_all_seeds():

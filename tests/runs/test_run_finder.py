@@ -48,7 +48,10 @@ def test_a_missing_run_is_refused_with_the_likely_name(runs):
     assert isinstance(caught.value, FileNotFoundError)
     with pytest.raises(CheckpointError, match="give a run folder or a checkpoint in it"):
         find_checkpoint("something else")
-    names = "there are best, best_egocentric, camera_real, jetbot_camera, jetbot_egocentric, real_jetbot"
+    names = (
+        "there are best, best_egocentric, camera_real, jetbot_camera, jetbot_egocentric,"
+        " real_jetbot"
+    )
     with pytest.raises(NotFoundError, match=names):
         find_run("pretrained:x")
 
