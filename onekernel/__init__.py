@@ -30,11 +30,12 @@ The parts, each of which imports only from those before it:
 
 - `lower`: a jaxpr to operations on scalars, placed in blocks
 - `codegen`: these blocks to LLVM IR
-- `kernel`: a kernel as a JAX primitive; `errors`: what it raises
+- `kernel`: a kernel as a JAX primitive; `keys`: random keys as words; `errors`: what it raises
 - `fingerprint`: a hash of a traced function and the kernels in it
 - `cpu`, `gpu`: these to machine code and PTX, and its launch by XLA; `backends`: both
 - `wasm`: these to WebAssembly, whose functions a web page calls
 - `check`: a kernel's results beside XLA's
+- `derivatives`: what JAX differentiates, as a kernel forward and one backward
 - `fused`: a function of one instance as one kernel, with another kernel inside
 - `explanation`: what the compiler made of it
 - `aot`: compiled programs from one process to the next

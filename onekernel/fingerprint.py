@@ -150,6 +150,8 @@ class _Hasher:
         if kernel.identity is not None:
             self._word("kernel", kernel.identity, kernel.steps)
             return
+        if kernel.unsupported:
+            raise _UnknownError(kernel)
         self._word("kernel", kernel.carried, kernel.steps, kernel.impl)
         self.add(kernel.table)
         self.add([str(x) for x in kernel.argument_dtypes or ()])

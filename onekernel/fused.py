@@ -16,19 +16,18 @@ Protocol:
    is made of.
 3. A function that cannot be lowered, or calls several kernels, is left to XLA, and `on_unsupported`
    says what is told.
-4. JAX differentiates what was traced, in place of the kernel, and a warning says so.
+4. The derivatives of a kernel without another inside are kernels, too (`onekernel.derivatives`).
 5. With `ONEKERNEL_CHECK=1` in the environment, each new kernel is compared with XLA on random
    numbers before its first use (`onekernel.check`).
 """
 
-import contextlib
 import contextvars
 import dataclasses
 import functools
 import math
 import os
 import warnings
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Literal as Choice
 from typing import cast, overload
 
@@ -41,9 +40,11 @@ from jaxtyping import Array, PyTree
 
 from onekernel.backends import default_backend
 from onekernel.check import check
+from onekernel.derivatives import Derivatives
 from onekernel.errors import KernelError, UnsupportedError
-from onekernel.kernel import Kernel, called_by, is_debugging, varying_axes
-from onekernel.lower import MAX_ARRAY_BYTES, scalarize_part
+from onekernel.kernel import Kernel, called_by, is_debugging, varying_alike, varying_axes
+from onekernel.keys import with_key, without_key, words_of
+from onekernel.lower import MAX_ARRAY_BYTES, LateProgram, ScalarProgram, scalarize_part
 
 CHECK = "ONEKERNEL_CHECK"
 """Environment variable: with `1`, kernels are checked before their first use."""
@@ -89,8 +90,9 @@ def fuse(
     """Return a function of one instance as one kernel, which `jax.vmap` runs for many instances.
 
     It is a function like any other to `jax.jit`, `jax.vmap`, `jax.lax.scan` and `jax.shard_map`.
-    Results differ from XLA's by round-off. JAX differentiates the function itself, with a warning:
-    a derivative is no kernel. Also usable as a decorator, with or without arguments.
+    Results differ from XLA's by round-off. Its derivatives are kernels, too: one forward, which
+    also returns what the other needs, and one backward. Also usable as a decorator, with or without
+    arguments.
 
     Args:
       function: a pure JAX function of one instance. Its arguments and results are pytrees of
@@ -153,7 +155,8 @@ class Fused:
             return self._function(*arguments, **keywords)
         # A kernel takes flat arrays: it is found by the tree, shapes and dtypes of the arguments.
         leaves, structure = jax.tree.flatten((arguments, keywords))
-        arrays = list(map(_as_array, leaves))
+        # What depends on no instance is the same for all devices, and its derivative their sum.
+        arrays = varying_alike(list(map(_as_array, leaves)))
         avals = [x.aval for x in arrays]
         lowered = self._find(structure, avals)
         if isinstance(lowered.one, UnsupportedError):
@@ -163,8 +166,8 @@ class Fused:
             # Inside of `jax.shard_map`, an array varies along axes of the mesh. A check runs
             # outside, where there are none.
             self._find(structure, [ShapedArray(x.shape, x.dtype) for x in avals]).check()
-        results = lowered.launch(*map(_without_key, arrays))
-        return jax.tree.unflatten(lowered.structure, map(_with_key, lowered.results, results))
+        results = lowered.launch(*map(without_key, arrays))
+        return jax.tree.unflatten(lowered.structure, map(with_key, lowered.results, results))
 
     def __get__(self, instance: object, owner: type | None = None) -> "Callable[..., PyTree]":
         """Return the method of an object, if the function is decorated in a class."""
@@ -210,26 +213,31 @@ class Fused:
         is_watched = jax.config.values["jax_disable_jit"] or is_debugging()
         return not is_watched and self._may_be_kernel()
 
-    def _report(self, error: UnsupportedError) -> None:
+    def _report(self, error: UnsupportedError, what: str = "") -> None:
         """Do what the user wants where there is no kernel."""
         if callable(self._on_unsupported):
             self._on_unsupported(error)
         elif self._on_unsupported == "raise":
             raise error
         else:
-            self._tell(f"one kernel cannot do {error}")
+            self._tell(f"one kernel cannot do {error}", what)
 
     def _no_back_end(self, reason: str) -> None:
         if self._on_unsupported == "raise":
             raise KernelError(reason, "platform")
         self._tell(reason)
 
-    def _tell(self, reason: str) -> None:
-        """Warn once that XLA computes the function, unless the user wants no warning."""
-        if self._on_unsupported != "xla" and reason not in self._told:
-            self._told.add(reason)
+    def _tell(self, reason: str, what: str = "") -> None:
+        """Warn once that XLA computes the function, unless the user wants no warning.
+
+        Args:
+          reason: why.
+          what: what of the function, in words before its name.
+        """
+        if self._on_unsupported != "xla" and what + reason not in self._told:
+            self._told.add(what + reason)
             name = getattr(self, "__name__", "a function")
-            warnings.warn(f"XLA computes {name}, slower: {reason}", stacklevel=4)
+            warnings.warn(f"XLA computes {what}{name}, slower: {reason}", stacklevel=4)
 
     def _find(self, structure: Hashable, avals: Sequence[ShapedArray]) -> "_Lowered":
         # The same function lowers differently under other settings of JAX.
@@ -248,20 +256,17 @@ class Fused:
     def _trace_and_lower(self, structure: Hashable, avals: Sequence[ShapedArray]) -> "_Lowered":
         def flat(*words: Array) -> PyTree:
             # Random keys are arguments as the words that they consist of.
-            arguments, keywords = jax.tree.unflatten(structure, map(_with_key, avals, words))
+            arguments, keywords = jax.tree.unflatten(structure, map(with_key, avals, words))
             # A result may be a number of Python, such as a reward that is always 1.
             return jax.tree.map(_as_array, self._function(*arguments, **keywords))
 
         def without_keys(*words: Array) -> PyTree:
             results = flat(*words)
             kinds.append(jax.tree.map(jax.typeof, results))
-            return jax.tree.map(_without_key, results)
+            return jax.tree.map(without_key, results)
 
         kinds: list[PyTree] = []
-        with _inside():
-            traced = _without_key_constants(
-                jax.make_jaxpr(without_keys)(*map(_shape_without_key, avals))
-            )
+        traced = _trace_inside(without_keys, map(words_of, avals))
         results, tree = jax.tree.flatten(kinds[-1])
         # A constant that is a tracer comes from a function that is being traced around this one.
         # Its value is not known now, so the kernel takes it as one more argument.
@@ -272,24 +277,51 @@ class Fused:
             # object.
             if not one.before:
                 one.explain, one.on_fallback = self._explain, self._on_fallback
-                one.on_derivative = self._warn_of_derivative
+                one.derivatives = self._derivatives(one, traced, places)
         except UnsupportedError as error:
             one = error
         return _Lowered(traced, tree, results, places, one)
 
-    def _warn_of_derivative(self) -> None:
-        if "derivative" not in self._told:
-            self._told.add("derivative")
-            name = getattr(self, "__name__", "a function")
-            warnings.warn(f"XLA computes the derivative of {name}, slower", stacklevel=2)
+    def _derivatives(
+        self, kernel: Kernel, traced: ClosedJaxpr, places: Sequence[int] = ()
+    ) -> Derivatives:
+        """Return what differentiates a kernel of this function, or of one of its derivatives."""
+        arguments, results = _arguments(traced, places), traced.jaxpr.outvars
+        what = "the derivative of "
+
+        def tell(reason: str) -> None:
+            self._tell(reason, what)
+
+        def make(traced: ClosedJaxpr) -> Kernel:
+            one = _whole(traced, (), is_late=True)
+            one.explain, one.derivatives = self._explain, self._derivatives(one, traced)
+            one.on_fallback = tell if self._on_fallback == self._no_back_end else self._on_fallback
+            dtypes[one] = _dtypes(traced.jaxpr.invars), _dtypes(traced.jaxpr.outvars)
+            return one
+
+        def is_ready(one: Kernel) -> bool:
+            if one.unsupported:
+                self._report(one.unsupported, what)
+            elif os.environ.get(CHECK) == "1" and not any(map(varying_axes, traced.in_avals)):
+                check(one, *dtypes[one])
+            return one.unsupported is None
+
+        dtypes: dict[Kernel, tuple[list[np.dtype], list[np.dtype]]] = {}
+        return Derivatives(
+            kernel,
+            _passed_avals(arguments),
+            _passed_avals(results),
+            trace=_trace_inside,
+            make=make,
+            is_ready=functools.cache(is_ready),
+        )
 
 
-@contextlib.contextmanager
-def _inside() -> Iterator[None]:
-    """Trace fused functions as the functions that they are made of."""
+def _trace_inside(function: Callable[..., PyTree], avals: Iterable[ShapedArray]) -> ClosedJaxpr:
+    """Trace a function, and the fused ones that it calls as the functions that they are made of."""
     token = _is_inside.set(True)
     try:
-        yield
+        return _without_key_constants(jax.make_jaxpr(function)(*avals))
     finally:
         _is_inside.reset(token)
 
@@ -360,20 +392,11 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
       UnsupportedError: an operation cannot be lowered, or there are several kernels in it.
     """
     arguments, results = _arguments(traced, places), traced.jaxpr.outvars
-    _check_passed(arguments, results)
-    # Functions around a step test whether its state is finite, so here NaN must stay NaN.
-    lower = functools.partial(scalarize_part, traced, words=True, finite=False)
     calls = [x for x in traced.jaxpr.eqns if called_by(x) is not None]
     # Without a kernel inside, the whole function becomes one that runs once.
     if not calls:
-        return Kernel(
-            lower(arguments, results),
-            carried=0,
-            steps=1,
-            fallback=_fallback(traced, places),
-            argument_dtypes=_passed_dtypes(arguments),
-            result_dtypes=_passed_dtypes(results),
-        )
+        return _whole(traced, places)
+    _check_passed(arguments, results)
     # Otherwise cut the function at the call. The one step must be plain: not a map, not itself made
     # of three parts, and called for one instance.
     step = called_by(calls[0])
@@ -386,8 +409,8 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
     # The part in front computes the arguments of the call; the part behind computes the results
     # from the arguments of the function and the results of the call. `scalarize_part` lowers only
     # what its results need, so the cut needs no list of equations.
-    before = lower(arguments, calls[0].invars)
-    after = lower([*arguments, *calls[0].outvars], results)
+    before = _lower_part(traced, arguments, calls[0].invars)
+    after = _lower_part(traced, [*arguments, *calls[0].outvars], results)
     return Kernel(
         step.program,
         carried=step.carried,
@@ -401,6 +424,42 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
         argument_dtypes=_passed_dtypes(arguments),
         result_dtypes=_passed_dtypes(results),
     )
+
+
+def _whole(traced: ClosedJaxpr, places: Sequence[int], *, is_late: bool = False) -> Kernel:
+    """Return a traced function without a kernel inside as a kernel that runs once.
+
+    Args:
+      traced: the function.
+      places: as for `_lower`.
+      is_late: whether it is lowered when it is compiled.
+
+    Raises:
+      UnsupportedError: an operation cannot be lowered.
+    """
+    arguments, results = _arguments(traced, places), traced.jaxpr.outvars
+
+    def lower() -> ScalarProgram:
+        _check_passed(arguments, results)
+        return _lower_part(traced, arguments, results)
+
+    shapes = [[x.shape for x in _passed_avals(atoms)] for atoms in (arguments, results)]
+    return Kernel(
+        LateProgram(lower, *shapes) if is_late else lower(),
+        carried=0,
+        steps=1,
+        fallback=_fallback(traced, places),
+        argument_dtypes=_passed_dtypes(arguments),
+        result_dtypes=_passed_dtypes(results),
+    )
+
+
+def _lower_part(
+    traced: ClosedJaxpr, arguments: Sequence[Var], results: Sequence[Var | Literal]
+) -> ScalarProgram:
+    """Lower a part of a traced function, whose arguments and results are those of a kernel."""
+    # Functions around a step test whether its state is finite, so here NaN must stay NaN.
+    return scalarize_part(traced, arguments, results, words=True, finite=False)
 
 
 def _check_passed(arguments: Sequence[Var], results: Sequence[Var | Literal]) -> None:
@@ -463,6 +522,11 @@ def _passed_dtypes(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
     return [np.dtype(np.float32) if dtype.kind == "b" else dtype for dtype in _dtypes(atoms)]
 
 
+def _passed_avals(atoms: Sequence[Var | Literal]) -> list[ShapedArray]:
+    pairs = zip(atoms, _passed_dtypes(atoms), strict=True)
+    return [cast(ShapedArray, x.aval).update(dtype=t, weak_type=False) for x, t in pairs]
+
+
 def _to_pass(x: Array) -> Array:
     return x.astype(jnp.float32) if x.dtype.kind == "b" else x
 
@@ -489,50 +553,21 @@ def _as_array(x: PyTree) -> Array:
         ) from None
 
 
-def _is_key(x: Array | ShapedArray) -> bool:
-    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
-def _without_key(x: Array) -> Array:
-    """Return an array, or the words of an array of random keys."""
-    return jax.random.key_data(x) if _is_key(x) else x
-
-
-def _with_key(kind: ShapedArray, x: Array) -> Array:
-    """Return an array as it is of a kind; the inverse of `_without_key`."""
-    return jax.random.wrap_key_data(x, impl=_key_kind(kind.dtype)) if _is_key(kind) else x
-
-
 def _without_key_constants(traced: ClosedJaxpr) -> ClosedJaxpr:
     """Return a traced function whose constants are words in place of random keys.
 
     Keys become constants where a function uses one from outside of it.
     """
-    words = [_without_key(x) if hasattr(x, "dtype") else x for x in traced.consts]
+    words = [without_key(x) if hasattr(x, "dtype") else x for x in traced.consts]
     if all(x is y for x, y in zip(words, traced.consts, strict=True)):
         return traced
 
     def function(*arguments: Array) -> list[Array]:
         pairs = zip(traced.consts, words, strict=True)
-        consts = [_with_key(x.aval, y) if hasattr(x, "aval") else x for x, y in pairs]
+        consts = [with_key(x.aval, y) if hasattr(x, "aval") else x for x, y in pairs]
         return jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, consts))(*arguments)
 
     return jax.make_jaxpr(function)(*traced.in_avals)
-
-
-@functools.cache
-def _key_kind(dtype: np.dtype) -> Hashable:
-    """Return the kind of the random keys of a dtype, such as "threefry2x32"."""
-    found: list[Hashable] = []
-    # Only a key can be asked for its kind, and a traced one will do.
-    jax.eval_shape(
-        lambda key: found.append(jax.random.key_impl(key)), jax.ShapeDtypeStruct((), dtype)
-    )
-    return found[0]
-
-
-def _shape_without_key(x: ShapedArray) -> ShapedArray:
-    return jax.eval_shape(_without_key, x) if _is_key(x) else x
 
 
 def _shape(x: PyTree) -> ShapedArray:

@@ -20,7 +20,7 @@ Protocol: JAX sees the kernel as a primitive.
    process's default is, so that programs for CPUs and GPUs can exist side by side. The back end
    (`onekernel.cpu` or `onekernel.gpu`) compiles and launches the kernel. Without a back end, a
    kernel with `impl = auto` runs its fallback in JAX, and any other one raises a `KernelError`.
-4. Differentiation raises a `KernelError`, or differentiates the fallback (`on_derivative`).
+4. Differentiation makes other kernels (`onekernel.derivatives`), or raises a `KernelError`.
 """
 
 import contextlib
@@ -82,9 +82,8 @@ class Kernel:
     on_fallback: Callable[[str], None] = warn_of_fallback
     """A function that is called with the reason where the fallback runs although the platform has a
     back end."""
-    on_derivative: Callable[[], None] | None = None
-    """A function that is called where JAX differentiates the kernel: the derivative of the fallback
-    takes its place. None: the kernel cannot be differentiated."""
+    derivatives: "Differentiable | None" = None
+    """What differentiates the kernel; None: it cannot be differentiated."""
     on_batch: Callable[[], None] = lambda: None
     """A function that is called where `jax.vmap` batches the kernel."""
     before: ScalarProgram | None = None
@@ -200,6 +199,22 @@ class Compiled(NamedTuple):
     """The registers that it uses."""
     spilled: str
     """What did not fit into them."""
+
+
+class Differentiable(Protocol):
+    """A `Differentiable` differentiates a kernel by JAX's rules for a primitive."""
+
+    def jvp(
+        self, primals: Sequence[Array], tangents: Sequence[Array | ad.Zero]
+    ) -> tuple[list[Array], list[Array | ad.Zero]]:
+        """Return results and their tangents."""
+        ...
+
+    def transpose(
+        self, cotangents: Sequence[Array | ad.Zero], arguments: Sequence[Array | ad.UndefinedPrimal]
+    ) -> list[Array | ad.Zero | None]:
+        """Return the cotangents of the arguments that are not known."""
+        ...
 
 
 class Backend(Protocol):
@@ -341,21 +356,44 @@ def varying_axes(x: ShapedArray) -> frozenset[Hashable]:
     return frozenset() if kind is None else kind.varying
 
 
+def varying_alike(arrays: Sequence[Array]) -> list[Array]:
+    """Return arrays that vary along the same axes of a mesh, inside of `jax.shard_map`."""
+    axes = frozenset().union(*(varying_axes(jax.typeof(x)) for x in arrays))
+
+    def spread(x: Array) -> Array:
+        lacking = tuple(axes - varying_axes(jax.typeof(x)))
+        return jax.lax.pcast(x, lacking, to="varying") if lacking else x
+
+    return list(map(spread, arrays))
+
+
 def _differentiate(
     primals: Sequence[Array], tangents: Sequence[Array | ad.Zero], *, kernel: Kernel
-) -> tuple[list[Array], list[Array]]:
-    """Compute a kernel's results and their directional derivatives by its fallback."""
-    if kernel.on_derivative is None:
+) -> tuple[list[Array], list[Array | ad.Zero]]:
+    return _derivatives(kernel).jvp(primals, tangents)
+
+
+def _transpose(
+    cotangents: Sequence[Array | ad.Zero],
+    *arguments: Array | ad.UndefinedPrimal,
+    kernel: Kernel,
+) -> list[Array | ad.Zero | None]:
+    return _derivatives(kernel).transpose(cotangents, arguments)
+
+
+def _derivatives(kernel: Kernel) -> Differentiable:
+    """Return what differentiates a kernel.
+
+    Raises:
+      KernelError: it cannot be differentiated.
+    """
+    if kernel.derivatives is None:
         raise kernel.explain(KernelError("one kernel cannot be differentiated", "derivative"))
-    kernel.on_derivative()
-    # The fallback is a function of one instance: batch it over all axes in front.
-    function = kernel.fallback
-    for _ in _batch_shape(kernel, primals):
-        function = jax.vmap(function)
-    return jax.jvp(function, tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))
+    return kernel.derivatives
 
 
 ad.primitive_jvps[_kernel_p] = _differentiate
+ad.primitive_transposes[_kernel_p] = _transpose
 
 
 def probe(
@@ -408,10 +446,10 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
             obstacle = backend.obstacle() if backend else "there are no kernels for this platform"
             if usable:
                 obstacle = f"one kernel cannot do {kernel.unsupported}"
+            # The fallback is written for one instance. It may raise an error of JAX's.
+            results = jax.vmap(lambda *leaves: kernel.fallback(*leaves))(*flat)
             if obstacle:
                 kernel.on_fallback(obstacle)
-            # The fallback is written for one instance.
-            results = jax.vmap(lambda *leaves: kernel.fallback(*leaves))(*flat)
         else:
             platform = backend.PLATFORM if backend else "another platform"
             raise kernel.explain(KernelError(f"this program is for {platform}", "platform"))

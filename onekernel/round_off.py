@@ -61,7 +61,12 @@ _SUMS = _SOLVERS | frozenset(
 )
 """Names of the primitives whose results are each made of many numbers, and rounded on the way."""
 
-_CALLS = frozenset({"checkpoint", "custom_jvp_call", "custom_vjp_call", "jit", "pjit", "remat2"})
+_CALLS = frozenset(
+    {
+        *("checkpoint", "closed_call", "custom_jvp_call", "custom_vjp_call", "eval_jaxpr", "jit"),
+        *("pjit", "remat2"),
+    }
+)
 """Names of the primitives that call a function once."""
 
 

@@ -261,7 +261,10 @@ def _nextafter(x: Array, y: Array) -> Array:
 def _reduce_precision(x: Array, *, exponent_bits: int, mantissa_bits: int) -> Array:
     # Keep the exponent and drop the last bits of the fraction, as in bfloat16.
     dropped = 23 - mantissa_bits
-    if exponent_bits == 8 and dropped > 0:
+    if exponent_bits >= 8 and dropped <= 0:
+        # With as many bits as it has, which is what `jax.checkpoint` asks of what it stores.
+        return x
+    if exponent_bits == 8:
         bits = jax.lax.bitcast_convert_type(x, jnp.uint32)
         # Round to the nearest, and half to the even.
         odd = (bits >> dropped) & 1

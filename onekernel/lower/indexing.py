@@ -147,8 +147,11 @@ RULES: dict[str, Rule] = {
     # The scalars of an instance are where it is computed.
     "device_put": lambda equation, *xs: list(xs),
     "empty": _empty,
+    "empty2": _empty,
     "expand_dims": _reshape,
     "iota": _iota,
+    # What `jax.checkpoint` may store has a name.
+    "name": lambda equation, x: x,
     "optimization_barrier": lambda equation, *xs: list(xs),
     "pad": _pad,
     "pvary": lambda equation, *xs: list(xs),

@@ -405,7 +405,7 @@ class _JaxprLowering:
     def _custom_jvp_call(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         return self.lower(equation.params["call_jaxpr"], operands)
 
-    _custom_vjp_call = _custom_jvp_call
+    _custom_vjp_call = _closed_call = _eval_jaxpr = _custom_jvp_call
 
     def _platform_index(self, equation: JaxprEqn) -> ScalarArray:
         # `jax.lax.platform_dependent`: choose the case that is written for all platforms, whose

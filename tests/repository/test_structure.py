@@ -42,10 +42,9 @@ which are for others' programs, or `startup`, which is for commands."""
 
 
 ENGINE_ORDER = (
-    *("errors", "background", "trusted_files", "lower", "codegen", "kernel", "fingerprint"),
-    *("cpu", "gpu", "wasm", "backends", "round_off", "check", "fused", "explanation", "aot"),
-    "build",
-    "mujoco",
+    *("errors", "background", "trusted_files", "lower", "codegen", "keys", "kernel", "fingerprint"),
+    *("cpu", "gpu", "wasm", "backends", "round_off", "check", "derivatives", "fused"),
+    *("explanation", "aot", "build", "mujoco"),
 )
 """Modules and rooms of the engine: each imports only itself and those before it."""
 
