@@ -25,6 +25,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "plan": ("plan", "predict the memory that a training needs"),
     "tune": ("tune", "search for hyperparameters, many trials at once"),
     "export": ("export", "write a policy to files that run without this package"),
+    "share": ("share", "upload a run to the Hugging Face Hub for others"),
     "sim2real": ("sim2real", "compare the log of a real drive with the simulator"),
     "replay": ("replay", "replay the steps that led to a non-finite state"),
     "pretrained": ("pretrained", "copy the policies that come with the package"),

@@ -194,6 +194,11 @@ def tell(text: str) -> None:
     print(errors.printable_lines(text), flush=True)
 
 
+def note(text: str) -> None:
+    """Print a line for the user on standard error, where it does not mix with results."""
+    print(errors.printable(text), file=sys.stderr, flush=True)
+
+
 def _report_error(error: BaseException) -> int | None:
     """Print the line about an error that is no bug, and return its exit code; None if it is one."""
     match error:
@@ -412,7 +417,7 @@ def find_policy(name: str) -> Path:
     """
     with startup.exit_on_interrupt():
         from jetbot_mjx.runs import explain_missing, find_run
-    path = find_run(name)
+    path = find_run(name, say=note)
     what = f"no checkpoint at {path.absolute()}"
     with errors.os_errors(what):
         reason = explain_missing(path.absolute())
@@ -433,8 +438,8 @@ def add_checkpoint_arguments(
         a run must be given.
     """
     what = (
-        "a run folder or one checkpoint folder of it; or latest, the name of a folder in runs/, or"
-        " pretrained:NAME"
+        "a run folder or one checkpoint folder of it; or latest, the name of a folder in runs/,"
+        " pretrained:NAME, or hf:USER/NAME"
     )
     nargs = None
     if several:

@@ -43,7 +43,7 @@ def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
     with startup.exit_on_interrupt():
         from jetbot_mjx.runs import default_run_dir, find_run, find_run_config
     if options.resume:
-        run_dir = find_run(options.resume)
+        run_dir = find_run(options.resume, say=cli.note)
         options.config = find_run_config(run_dir)
     else:
         run_dir = options.run_dir or default_run_dir(options.config)

@@ -22,6 +22,9 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" /
 Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).mkdir(mode=0o700, parents=True, exist_ok=True)
 # What trainings record of the code that they ran is not the user's either.
 os.environ.setdefault("XDG_STATE_HOME", str(ROOT / ".cache" / "state"))
+# Neither the user's token nor Xet, which speaks to real servers only, instead of LFS.
+os.environ.setdefault("HF_HOME", str(ROOT / ".cache" / "huggingface"))
+os.environ.setdefault("HF_HUB_DISABLE_XET", "1")
 # Small programs too: a process of the tests compiles a hundred of them before it begins.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 if os.environ["JAX_PLATFORMS"] == "cpu":

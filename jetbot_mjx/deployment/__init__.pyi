@@ -3,5 +3,7 @@ from .drive_comparison import summarize_drive as summarize_drive
 from .exporters import read_exported as read_exported
 from .policy_export import export_policy as export_policy
 from .policy_export import summarize_export as summarize_export
+from .sharing import share_run as share_run
+from .sharing import summarize_sharing as summarize_sharing
 from .web_page import summarize_web_page as summarize_web_page
 from .web_page import write_web_page as write_web_page

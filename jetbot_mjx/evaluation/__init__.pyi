@@ -24,6 +24,7 @@ from .plots import plot_trajectories as plot_trajectories
 from .plots import theme as theme
 from .plots import to_png as to_png
 from .report import Report as Report
+from .result_names import find_report as find_report
 from .result_names import name_with_count as name_with_count
 from .return_report import ReturnComparison as ReturnComparison
 from .return_report import ReturnReport as ReturnReport

@@ -11,6 +11,10 @@ from .checkpoint_store import checkpoint_path as checkpoint_path
 from .checkpoint_store import checkpoint_steps as checkpoint_steps
 from .checkpoint_store import digest as digest
 from .checkpoint_store import stored_score as stored_score
+from .hub import RUN_FILES as RUN_FILES
+from .hub import RUN_FOLDERS as RUN_FOLDERS
+from .hub import check_upload as check_upload
+from .hub import upload_run as upload_run
 from .metrics import EVALUATION_VIDEO as EVALUATION_VIDEO
 from .metrics import METRICS as METRICS
 from .metrics import CompileClock as CompileClock

@@ -1,7 +1,7 @@
 """Find runs by name, list them, and copy those that come with the package.
 
-A run may be named by its path, by its folder's name in `runs/`, as `latest`, or, if it comes with
-the package, as `pretrained:NAME`.
+A run may be named by its path, by its folder's name in `runs/`, as `latest`, as `pretrained:NAME`
+if it comes with the package, or as `hf:USER/NAME` if it is on the Hugging Face Hub.
 """
 
 import difflib
@@ -9,12 +9,13 @@ import os
 import shlex
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from jetbot_mjx.config import Config, run_around
 from jetbot_mjx.errors import NotFoundError, UserError, clipped, os_errors, printable
+from jetbot_mjx.runs import hub
 from jetbot_mjx.runs.metrics import METRICS, read_history
 from jetbot_mjx.runs.run_dir import (
     CONFIG,
@@ -35,6 +36,7 @@ PRETRAINED = Path(__file__).parents[1] / "assets" / "pretrained"
 
 _LATEST = "latest"
 _PREFIX = "pretrained:"
+_HUB = "hub"
 
 
 class RunInfo(NamedTuple):
@@ -70,17 +72,23 @@ def _shortest_name(path: Path) -> str:
     return path.name if path.parent == ROOT else str(path)
 
 
-def find_run(name: str | Path, root: Path = ROOT) -> Path:
+def find_run(name: str | Path, root: Path = ROOT, say: Callable[[str], None] | None = None) -> Path:
     """Return the path of a run or of a checkpoint, which need not exist.
 
     Args:
-      name: a path; the name of a folder in `root`; `latest`; or `pretrained:NAME`.
+      name: a path; the name of a folder in `root`; `latest`; `pretrained:NAME`; or
+        `hf:USER/NAME[@REVISION]`, which is downloaded to `root/hub/`.
       root: the folder of runs.
+      say: a function that prints which revision was downloaded.
 
     Raises:
-      NotFoundError: there is no latest run, or none of this name comes with the package.
+      NotFoundError: there is no latest run, or none of this name comes with the package or is on
+        the Hub.
+      UserError: as for `download_run`.
     """
     text = str(name)
+    if text.startswith(hub.PREFIX):
+        return hub.download_run(text, root / _HUB, say)
     if text.startswith(_PREFIX):
         known = sorted(path.name for path in PRETRAINED.iterdir())
         if (own := text.removeprefix(_PREFIX)) in known:

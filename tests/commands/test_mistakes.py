@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import jetbot_mjx
+from helpers import fake_hub
 from helpers.damage import damage_about
 from jetbot_mjx import __main__ as entry
 from jetbot_mjx import cli
@@ -154,6 +155,18 @@ def type_(home, monkeypatch, capfd):
         return caught.value.code, out, err.replace(str(home), "~")
 
     return type_
+
+
+@pytest.fixture(scope="module", autouse=True)
+def hub():
+    """A Hub with a run and other things, for one who is logged in as ada."""
+    with pytest.MonkeyPatch.context() as patch, fake_hub.serving() as server:
+        patch.setenv("HF_TOKEN", "hf_ada")
+        patch.setenv("HF_ENDPOINT", server.url)
+        server.commit("eve/jetbot", {"config.yaml": b""})
+        for name in ("ada/llm", "eve/llm"):
+            server.commit(name, {"model.safetensors": b""})
+        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -19,6 +19,7 @@ from jetbot_mjx import (
     play,
     pretrained,
     replay,
+    share,
     sim2real,
 )
 
@@ -73,6 +74,7 @@ COMMANDS = {
     "replay": replay,
     "play": play,
     "export": export,
+    "share": share,
     "sim2real": sim2real,
     "pretrained": pretrained,
     "configs": list_configs,
@@ -86,7 +88,7 @@ def commands(block):
     for line in block.replace("\\\n", " ").splitlines():
         words = []
         lexer = shlex.shlex(line, posix=True, punctuation_chars=True)
-        lexer.wordchars += "$,:[]{}+"
+        lexer.wordchars += "$,:[]{}+@"
         for word in [*lexer, ";"]:
             if set(word) <= set(";&|"):
                 if words:

@@ -66,7 +66,7 @@ LARGEST_ROOM = 20
 COMMANDS = ("__main__", *(module for module, _ in command_line.COMMANDS.values()))
 """A command imports whatever it likes but adapters and other commands."""
 
-MOST_AT_THE_ROOT = 27
+MOST_AT_THE_ROOT = 28
 
 MAY_PRINT_AND_PARSE = ("cli", *COMMANDS, "onekernel.explanation")
 

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import jetbot_mjx
+from helpers import fake_hub
 from helpers.damage import damage_about
 from helpers.untrained import write_untrained_run
 from jetbot_mjx import cli
@@ -261,6 +262,53 @@ def test_each_attack_would_run_where_the_user_asks_for_it(attack, run, canary):
 def test_trust_is_an_option_of_each_command(command, run, canary, capfd):
     a_stored_task(run, canary)
     code, lines = type_(capfd, command, run, "--trust")
+    assert canary.exists()
+    assert code == 2
+    assert "has no 'Task'" in lines[-1]
+
+
+@pytest.fixture
+def share(monkeypatch):
+    """Makes a folder the content of a stranger's repository on the Hub, and deletes it here."""
+    pytest.importorskip("huggingface_hub")
+    with fake_hub.serving() as server:
+        monkeypatch.setenv("HF_ENDPOINT", server.url)
+
+        def share(run):
+            files = {x.relative_to(run).as_posix(): x for x in run.rglob("*") if x.is_file()}
+            server.commit("eve/run", {name: path.read_bytes() for name, path in files.items()})
+            os.chdir(run.parent)
+            shutil.rmtree(run)
+
+        yield share
+
+
+@pytest.mark.parametrize(
+    ("attack", "command"),
+    [
+        # Its file is none of those that are downloaded.
+        *((attack, "evaluate") for attack in ATTACKS if attack is not a_file_in_the_run),
+        *((a_stored_task, name) for name in COMMANDS if name not in ("evaluate", "replay")),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.__name__,
+)
+def test_no_command_runs_code_of_a_run_on_the_hub(attack, command, run, share, canary, capfd):
+    attack(run, canary)
+    share(run)
+    before = list(sys.path)
+    code, (told, line) = type_(capfd, command, "hf:eve/run")
+    assert not canary.exists()
+    assert code == 2
+    assert told.startswith("hf:eve/run: revision ")
+    assert "would run, which no training of yours on this machine has run: read " in line
+    assert line.endswith(", then add --trust (in Python: trust=True)")
+    assert sys.path == before
+
+
+def test_code_of_a_run_on_the_hub_runs_where_the_user_asks_for_it(run, share, canary, capfd):
+    a_stored_task(run, canary)
+    share(run)
+    code, lines = type_(capfd, "evaluate", "hf:eve/run", "--trust")
     assert canary.exists()
     assert code == 2
     assert "has no 'Task'" in lines[-1]
