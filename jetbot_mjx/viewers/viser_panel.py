@@ -7,7 +7,7 @@ from typing import Literal
 import jinja2
 import viser
 
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, shown
 from jetbot_mjx.viewers.player import SPEEDS, Player
 from jetbot_mjx.viewers.step_fns import AGENTS, KEYBOARD
 from jetbot_mjx.viewers.viser_camera import CAMERAS
@@ -84,7 +84,7 @@ class ControlPanel:
         gui, player = self._server.gui, self._player
         if player.robots > 1:
             self.robot = robot = gui.add_slider("Robot", 0, player.robots - 1, 1, player.robot)
-            robot.on_update(lambda _: self._ask(setattr, player, "robot", robot.value))
+            robot.on_update(lambda _: self._ask(self._slide, "robot", robot))
         self.agent = gui.add_dropdown("Agent", AGENTS, initial_value=player.agent)
         self.checkpoint = gui.add_dropdown(
             "Checkpoint", _labels(player), initial_value=_label(player.checkpoint)
@@ -98,7 +98,7 @@ class ControlPanel:
         self.agent.on_update(lambda _: self._ask(self._switch_agent))
         self.checkpoint.on_update(lambda _: self._ask(self._switch_checkpoint))
         self.buttons.on_click(lambda event: self._ask(self._press, event.target.value))
-        speed.on_update(lambda _: self._ask(setattr, player, "speed", speed.value))
+        speed.on_update(lambda _: self._ask(self._slide, "speed", speed))
         camera.on_update(lambda _: self._ask(setattr, self._scene.cameras, "mode", camera.value))
         shadows.on_update(lambda _: self._ask(self._scene.cast_shadows, shadows.value))
 
@@ -116,7 +116,7 @@ class ControlPanel:
             )
 
         def follow_sliders() -> None:
-            player.drive(ahead.value, math.radians(left.value))
+            player.drive(_within(ahead), math.radians(_within(left)))
 
         def press(do: Callable[..., None], *given: int) -> None:
             do(*given)
@@ -140,7 +140,12 @@ class ControlPanel:
         command.on_trigger(lambda _: self._ask(*press))
         return command
 
+    def _slide(self, name: str, slider: viser.GuiSliderHandle) -> None:
+        setattr(self._player, name, _within(slider))
+
     def _switch_agent(self) -> None:
+        if self.agent.value not in AGENTS:
+            raise ValueError(f"{shown(self.agent.value)} is no agent")
         self._player.agent = self.agent.value
         is_keyboard = self.agent.value == KEYBOARD
         # Show the sliders last: once a page has them, its keys work.
@@ -168,6 +173,17 @@ class ControlPanel:
                 self._player.reset()
             case _:
                 self._player.paused = not self._player.paused
+
+
+def _within(slider: viser.GuiSliderHandle) -> float:
+    """Return the value of a slider, which a page could set to any.
+
+    Raises:
+      ValueError: it is out of bounds.
+    """
+    if not slider.min <= slider.value <= slider.max:
+        raise ValueError(f"{shown(slider.value)} is not from {slider.min} to {slider.max}")
+    return slider.value
 
 
 def _label(env_steps: int) -> str:

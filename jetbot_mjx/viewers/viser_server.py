@@ -29,7 +29,7 @@ import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, clipped, printable
 from jetbot_mjx.viewers.player import Player
 from jetbot_mjx.viewers.realtime import Clock
 from jetbot_mjx.viewers.viser_panel import ControlPanel
@@ -90,7 +90,7 @@ class ViserViewer(contextlib.AbstractContextManager["ViserViewer"]):
         if self.server.get_port() != port:
             self.close()
             raise UserError(f"--port {port} has just been taken by another program: try again")
-        self._player = player
+        self._player, self._tell = player, tell
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self.scene = Scene(self.server, player, self._ask)
         self.panel = ControlPanel(self.server, player, self.scene, self._ask)
@@ -106,7 +106,11 @@ class ViserViewer(contextlib.AbstractContextManager["ViserViewer"]):
     def step(self) -> None:
         """Execute queued requests, make the steps that are due, and show the result."""
         while not self._requests.empty():
-            self._requests.get()()
+            try:
+                self._requests.get()()
+            # Any program on this machine may send what no page of this player's would.
+            except (ValueError, LookupError, TypeError, ArithmeticError) as error:
+                self._tell(f"ignored what a page asked for: {printable(clipped(str(error)))}")
         self._player.advance()
         if self._scene_clock.due(time.monotonic()):
             self.scene.show()

@@ -4,6 +4,7 @@ import io
 import math
 import re
 import socket
+import time
 import types
 import urllib.error
 import urllib.request
@@ -675,3 +676,33 @@ def test_a_task_whose_goals_stay_says_so_and_plays_on(player, monkeypatch):
         player.tick()
     finally:
         server.stop()
+
+
+@pytest.mark.parametrize(
+    ("control", "value"),
+    [
+        ("speed", math.nan),
+        ("speed", 1e300),
+        ("ahead", -math.inf),
+        ("left", 1e9),
+        ("agent", "nobody"),
+        ("checkpoint", "x steps"),
+    ],
+)
+def test_what_no_page_of_ours_would_send_is_ignored(browser, player, monkeypatch, control, value):
+    told = []
+    monkeypatch.setattr(browser, "_tell", told.append)
+    handle = getattr(browser.panel, control)
+    before, own = (player.speed, player.agent, player.checkpoint, player.command), handle.value
+    handle.value = value
+    for _ in range(100):
+        browser.step()
+        if told:
+            break
+        time.sleep(0.02)
+    assert len(told) == 1
+    assert told[0].startswith("ignored what a page asked for: ")
+    assert (player.speed, player.agent, player.checkpoint, player.command) == before
+    handle.value = own
+    time.sleep(0.1)
+    answer(browser)
