@@ -59,12 +59,36 @@ _NEEDED = (
 )
 """Keys of `policy.json` that a drive needs."""
 
-_NUMBERS = ("rest_height", "goal_height", "success_radius", "control_period")
-"""Those of them that are one number."""
-
 _NEEDED_OF_IMAGE = ("height", "width", "grey", "frames", "camera")
 _NEEDED_OF_CAMERA = ("position", "pitch_down_degrees", "lens", "matrix", "distortion")
 """Those of its entries `image` and `image.camera`, of a policy that sees."""
+
+_NUMBERS = (
+    ("rest_height", 1, -10.0, 10.0),
+    ("goal_height", 1, -10.0, 10.0),
+    ("success_radius", 1, 0.0, 1000.0),
+    ("control_period", 1, 1e-4, 10.0),
+    ("rest_quaternion", 4, -1.01, 1.01),
+    ("wheel_speeds.wheel_radius", 1, 1e-4, 10.0),
+)
+"""What of them is numbers: the key, how many numbers, and the least and largest of them."""
+
+_NUMBERS_OF_IMAGE = (
+    ("image.height", 1, 1, 4096),
+    ("image.width", 1, 1, 4096),
+    ("image.frames", 1, 1, 64),
+    ("image.camera.position", 3, -10.0, 10.0),
+    ("image.camera.pitch_down_degrees", 1, -180.0, 180.0),
+    ("image.camera.distortion", range(9), -1e3, 1e3),
+    ("image.camera.matrix.fx", 1, 1e-3, 1e6),
+    ("image.camera.matrix.fy", 1, 1e-3, 1e6),
+    ("image.camera.matrix.cx", 1, -1e6, 1e6),
+    ("image.camera.matrix.cy", 1, -1e6, 1e6),
+)
+"""Those of a policy that sees; bounds without a point are of whole numbers."""
+
+_MOST_CHARACTERS = 1000000
+"""Longest `policy.json`."""
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -142,12 +166,15 @@ def load_policy(folder: str) -> Policy:
     """
     try:
         with open(os.path.join(folder, "policy.json"), encoding="utf-8") as file:
-            spec = json.load(file)
+            text = file.read(_MOST_CHARACTERS + 1)
+        if len(text) > _MOST_CHARACTERS:
+            raise DriveError(f"{folder} is not an exported policy: policy.json is too long")
+        spec = json.loads(text)
         path = os.path.join(folder, "policy.py")
         flaw = _flaw(spec)
         if flaw:
             raise DriveError(f"{folder} is not an exported policy: policy.json {flaw}")
-        if "numpy" not in spec["files"] or not os.path.isfile(path):
+        if "numpy" not in dict(spec["files"]) or not os.path.isfile(path):
             raise DriveError(f"{folder} has no policy.py: export it with --format numpy")
         with open(path, encoding="utf-8") as file:
             source = file.read()
@@ -172,22 +199,62 @@ def load_policy(folder: str) -> Policy:
         raise DriveError(f"{path} cannot be run here: {error}")
 
 
-def _flaw(spec: dict) -> Optional[str]:
+def _flaw(spec: Any) -> Optional[str]:
     """Return what a drive needs and does not find in a policy spec, or None."""
-    missing = [name for name in _NEEDED if name not in spec]
+    if not isinstance(spec, dict):
+        return "holds no object"
+    needed, numbers = list(_NEEDED), _NUMBERS
     if "image" in spec:
-        image = spec["image"]
-        missing += ["image." + name for name in _NEEDED_OF_IMAGE if name not in image]
-        camera = image.get("camera", {})
-        missing += ["image.camera." + name for name in _NEEDED_OF_CAMERA if name not in camera]
-    if missing:
-        return f"lacks {missing[0]}"
-    for name in _NUMBERS:
-        if not (type(spec[name]) in (int, float) and math.isfinite(spec[name])):
-            return f"has {name} = {spec[name]!r}: it should be a finite number"
-    if spec["control_period"] <= 0:
-        return f"has control_period = {spec['control_period']!r}: it should be above 0"
+        needed += ["image." + name for name in _NEEDED_OF_IMAGE]
+        needed += ["image.camera." + name for name in _NEEDED_OF_CAMERA]
+        numbers += _NUMBERS_OF_IMAGE
+    for name in needed + [row[0] for row in numbers]:
+        if _entry(spec, name) is _MISSING:
+            return "lacks " + name
+    for name, count, least, most in numbers:
+        value = _entry(spec, name)  # type: Any
+        kinds = (int,) if isinstance(least, int) else (int, float)
+        values = [value] if count == 1 else value if isinstance(value, list) else []  # type: list
+        counts = (count,) if isinstance(count, int) else count
+        if len(values) not in counts or not all(
+            type(one) in kinds and least <= one <= most for one in values
+        ):
+            what = "a number" if count == 1 else f"{max(counts)} numbers"
+            bounds = f"from {least:g} to {most:g}"
+            return f"has {name} = {_shown(value)}: it should be {what} {bounds}"
+    parts = spec["observation"]
+    if not isinstance(parts, list) or not all(map(_is_part, parts)):
+        return "has no list of observations with name, frame and index"
+    if "image" in spec and spec["image"]["camera"]["lens"] not in ("pinhole", "opencv", "fisheye"):
+        return f"has image.camera.lens = {_shown(spec['image']['camera']['lens'])}"
     return None
+
+
+_MISSING = object()
+
+
+def _entry(spec: Any, name: str) -> Any:
+    """Return the value below several keys, or `_MISSING`."""
+    for key in name.split("."):
+        spec = spec.get(key, _MISSING) if isinstance(spec, dict) else _MISSING
+    return spec
+
+
+def _is_part(part: Any) -> bool:
+    return (
+        isinstance(part, dict)
+        and all(isinstance(part.get(name), str) for name in ("name", "frame"))
+        and isinstance(part.get("index"), list)
+    )
+
+
+def _shown(value: Any) -> str:
+    """Return a value in a few characters, also a number of more digits than Python writes."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        return "what is too long to be shown"
+    return text if len(text) <= 80 else text[:80] + "..."
 
 
 def arrival_radius(spec: dict) -> float:

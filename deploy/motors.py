@@ -18,8 +18,19 @@ _STANDSTILL = 0.005
 _STOP_TRIES = 5
 
 
+_LONGEST_LINE = 1000
+
+
 class DriveError(Exception):
     """Raised when the user can correct what is wrong; its message is one line."""
+
+    def __init__(self, message: str) -> None:
+        """Leave out the middle of a long message, and write as escapes what a terminal obeys."""
+        line = " ".join(message.splitlines())
+        if len(line) > _LONGEST_LINE:
+            line = line[: _LONGEST_LINE // 2] + " ... " + line[-_LONGEST_LINE // 2 :]
+        shown = (x if x.isprintable() else x.encode("unicode_escape").decode() for x in line)
+        super().__init__("".join(shown))
 
 
 class Wheel(NamedTuple):

@@ -14,6 +14,12 @@ from motors import DriveError
 _LEAST_COVERED = 0.75
 """Least share of the image's points that must lie in the picture."""
 
+_LARGEST_SIDE = 100000
+"""Largest side of a picture [pixels]."""
+
+_MOST_CHARACTERS = 1000000
+"""Longest file of a calibration."""
+
 _TURN_STEPS = 64
 """Steps from the optical axis to a direction in which a polynomial that turns back is found."""
 
@@ -48,7 +54,7 @@ def read_lens(path: str) -> LensCalibration:
     """
     try:
         with open(path, encoding="utf-8") as file:
-            text = file.read()
+            text = file.read(_MOST_CHARACTERS)
     except OSError as error:
         raise DriveError(f"--undistort {path}: {error.strerror}")
     except UnicodeDecodeError:
@@ -87,17 +93,22 @@ def _numbers(text: str, names: tuple, path: str) -> list:
 
 def _size(text: str, path: str) -> tuple:
     pair = re.search(r"^\s*cameraResolution:\s*\[\s*(\d+),?\s+(\d+)", text, re.MULTILINE)
-    sides = [] if pair is None else [int(pair.group(1)), int(pair.group(2))]
+    sides = [] if pair is None else [_side(pair.group(1)), _side(pair.group(2))]
     for name in () if pair else ("image_width", "image_height"):
         found = re.search(r"^\s*" + name + r":\s*(\d+)", text, re.MULTILINE | re.IGNORECASE)
         if found is None:
             raise DriveError(f"--undistort {path} is not a calibration: it lacks {name}")
-        sides.append(int(found.group(1)))
-    if min(sides) < 1:
+        sides.append(_side(found.group(1)))
+    if not 1 <= min(sides) <= max(sides) <= _LARGEST_SIDE:
         raise DriveError(
             f"--undistort {path}: pictures of {sides[0]} x {sides[1]} pixels are impossible"
         )
     return sides[0], sides[1]
+
+
+def _side(digits: str) -> int:
+    """Return a number, or one that is too large for more digits than Python reads."""
+    return int(digits) if len(digits) < 10 else _LARGEST_SIDE + 1
 
 
 class Reducer:

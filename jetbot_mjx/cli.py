@@ -160,6 +160,7 @@ def run_command(
         output could not be written.
     """
     startup.protect_output()
+    startup.keep_own_files()
     # Run the command and convert known errors to an exit code.
     try:
         startup.collect_garbage_late()
@@ -216,6 +217,9 @@ def _report_error(error: BaseException) -> int | None:
                 "error: the device's memory is too small: choose a smaller --episodes",
                 file=sys.stderr,
             )
+            return USER_ERROR
+        case RuntimeError() if reason := errors.lost_device(error):
+            print(f"error: the device failed: {errors.printable(reason)}", file=sys.stderr)
             return USER_ERROR
         case KeyboardInterrupt():
             print("interrupted", file=sys.stderr)

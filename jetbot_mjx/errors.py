@@ -12,13 +12,17 @@ import reprlib
 from collections.abc import Iterator
 from typing import TextIO
 
+_LONGEST_LINE = 2000
+"""Most characters of a message, which may quote names and values from a file."""
+
 
 class UserError(Exception):
     """Raised when the user can correct the error; its one-line message needs no traceback."""
 
     def __init__(self, message: str) -> None:
         """Join the lines of a message that quotes a key, a path or another library's message."""
-        super().__init__(printable(" ".join(message.splitlines())))
+        line = printable(" ".join(message.splitlines()))
+        super().__init__(clipped(line, _LONGEST_LINE))
 
 
 class InvalidError(UserError, ValueError):
@@ -154,6 +158,18 @@ _SHORT = _ShortRepr()
 def ran_out(error: Exception) -> bool:
     """Return whether JAX failed because a device ran out of memory."""
     return "RESOURCE_EXHAUSTED" in str(error)
+
+
+_LOST = ("CUDA_ERROR_", "DATA_LOSS:", "UNAVAILABLE:", "failed to synchronize", "device is lost")
+"""What JAX's error says if a device failed, and not the program: it may have been taken away."""
+
+
+def lost_device(error: BaseException) -> str:
+    """Return the reason if JAX failed because a device failed; nothing if it did not."""
+    text = str(error)
+    if ran_out(Exception(text)) or not any(one in text for one in _LOST):
+        return ""
+    return clipped(next(iter(text.splitlines())), 200)
 
 
 READER_LEFT = {errno.EPIPE, errno.EIO, errno.ECONNRESET}

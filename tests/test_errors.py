@@ -10,6 +10,7 @@ from jetbot_mjx.errors import (
     UserError,
     check_count,
     clipped,
+    lost_device,
     printable,
     printable_lines,
     ran_out,
@@ -21,6 +22,12 @@ from jetbot_mjx.errors import (
 
 def test_a_message_of_several_lines_becomes_one():
     assert str(UserError("first\nsecond\r\nthird")) == "first second third"
+
+
+def test_a_message_that_quotes_a_file_has_an_end():
+    message = str(UserError("a" * 50_000 + "b"))
+    assert len(message) < 2010
+    assert message.endswith("ab")
 
 
 def test_characters_that_a_terminal_obeys_are_written_out():
@@ -66,6 +73,22 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it():
 def test_a_device_that_ran_out_of_memory_is_told_from_other_failures():
     assert ran_out(RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes"))
     assert not ran_out(RuntimeError("INVALID_ARGUMENT"))
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        ("INTERNAL: CUDA_ERROR_ILLEGAL_ADDRESS: an error\nmore", "INTERNAL: CUDA_ERROR_ILLEGAL"),
+        ("UNAVAILABLE: the device is gone", "UNAVAILABLE: the device is gone"),
+        ("RESOURCE_EXHAUSTED: CUDA_ERROR_OUT_OF_MEMORY: failed to allocate", ""),
+        ("INVALID_ARGUMENT: shapes differ", ""),
+    ],
+)
+def test_a_device_that_failed_is_told_from_a_bug(message, reason):
+    found = lost_device(RuntimeError(message))
+    assert found.startswith(reason)
+    assert bool(found) is bool(reason)
+    assert "\n" not in found
 
 
 def test_only_a_stream_that_keeps_its_error_has_one():

@@ -1,5 +1,6 @@
 """Load a configuration: read it, apply overrides, and check every key, type and bound."""
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -141,7 +142,8 @@ def _find_robot_beside(config: Path, values: dict[str, object]) -> object:
     robot = values.get("robot")
     if isinstance(robot, dict) and isinstance(name := robot.get("file"), str):
         for folder in (config.parent, config.parent / FOLDER):
-            if (folder / name).is_file():
+            # Unlike that of `Path`, it knows that no file has a name that is too long.
+            if os.path.isfile(folder / name):
                 robot["file"] = str(folder / name)
                 return robot.pop("sha256", None)
     return None

@@ -59,6 +59,8 @@ def register(path: Path, code: str | None = None) -> str:
       ConfigError: a file cannot be read, is outside of the model's folder, or is not an MJCF; or
         there are more than `MAX_BYTES`.
     """
+    if "\0" in f"{path}{code}":
+        raise ConfigError(f"robot.file {path} cannot be read: embedded null byte")
     files: dict[str, bytes] = {}
     trees: list[ElementTree.Element] = []
     _collect(path, path.parent, files, trees)

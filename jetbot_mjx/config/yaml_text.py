@@ -5,6 +5,8 @@ is given twice.
 """
 
 import math
+import os
+import re
 import shlex
 from pathlib import Path
 
@@ -24,6 +26,10 @@ _MOST_YAML_CHARACTERS = 100_000
 _MOST_YAML_VALUES = 100_000
 """Largest size of a file of settings, as text and with all aliases replaced by what they stand for.
 """
+
+_MOST_COMMAS = 20_000
+_DEEPEST = 100
+"""Most commas and levels of brackets of a text: ruamel.yaml takes seconds for some longer ones."""
 
 
 _YAML_PROBLEMS = {
@@ -51,14 +57,16 @@ def read_yaml(path: Path, what: str = "config") -> dict[str, object]:
     except FileNotFoundError:
         message = f"{what} {path} does not exist: give the path of a YAML file"
         raise ConfigNotFoundError(message) from None
-    except (OSError, UnicodeDecodeError) as error:
-        if path.is_dir():
+    except (OSError, ValueError) as error:
+        if os.path.isdir(path):
             run = run_around(path) if what == "config" else None
             remedy = "give a YAML file"
             if run is not None:
                 remedy = f"to continue that run, give --resume {shlex.quote(str(run))}"
             raise ConfigError(f"{what} {path} is a folder: {remedy}") from None
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        if isinstance(error, UnicodeDecodeError):
+            reason = "it is not UTF-8 text"
         raise ConfigError(f"{what} {path} cannot be read: {reason}") from None
     if text.lstrip("\ufeff \n").startswith("<"):
         raise ConfigError(
@@ -101,6 +109,7 @@ def parse_any(text: str, source: str) -> object:
     Raises:
       ConfigError: the text is not valid YAML.
     """
+    _check_shape(text, source)
     yaml = YAML(typ="safe", pure=True)
     yaml.Constructor = _BoundedConstructor
     yaml.composer.warn_double_anchors = False
@@ -119,6 +128,25 @@ def parse_any(text: str, source: str) -> object:
         endless = "integer string conversion" in str(error)
         reason = "a number has too many digits" if endless else clipped(str(error))
         raise ConfigError(f"{source} is not valid YAML: {reason}") from None
+
+
+def _check_shape(text: str, source: str) -> None:
+    """Refuse text that would take seconds to read.
+
+    Args:
+      text: the text.
+      source: description of its origin for error messages.
+
+    Raises:
+      ConfigError: it has too many values, or too many brackets in each other.
+    """
+    if text.count(",") > _MOST_COMMAS:
+        raise ConfigError(f"{source} has more than {_MOST_COMMAS:,} values: leave some out")
+    depth = 0
+    for bracket in re.findall(r"[\[\]{}]", text):
+        depth = depth + 1 if bracket in "[{" else max(depth - 1, 0)
+        if depth > _DEEPEST:
+            raise ConfigError(f"{source} is not valid YAML: it is nested too deeply")
 
 
 class _BoundedConstructor(SafeConstructor):

@@ -1,8 +1,9 @@
 """Read a log of `deploy/drive.py`, and replay its motor values on a simulated JetBot."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -12,13 +13,27 @@ from matplotlib.typing import HashableList
 from jetbot_mjx.deployment.drive_pictures import LoggedPicture, picture_strip, read_picture
 from jetbot_mjx.deployment.simulated_camera import camera_config
 from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, replayed
-from jetbot_mjx.errors import UserError, os_errors
-from jetbot_mjx.runs import JsonObject
+from jetbot_mjx.errors import UserError, os_errors, shown
+from jetbot_mjx.runs import JsonObject, read_text
 
 FORMAT = "jetbot_mjx-drive/1"
 """The format that a log's first line names."""
 
 _LEAST_POSES = 2
+
+_LONGEST_GAP = 10.0
+"""Longest time between two lines [s]: a drive writes one in every control period."""
+
+_LARGEST = 1e6
+"""Largest position [m], heading [rad] or latency [s] of a drive."""
+
+_ERRORS = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError),
+    RecursionError,
+)
+"""Raised for a line that no drive has written."""
+
+_OUTCOMES = ("interrupted", "reached", "timed out")
 
 
 class DriveLog(NamedTuple):
@@ -93,27 +108,23 @@ def read_log(path: Path) -> DriveLog:
             if number == len(lines) and not text.endswith("}"):
                 break  # The drive ended while this line was written.
             period = json.loads(text)
-            left, right = map(float, period["motors"])
-            times.append(float(period["t"]))
+            left, right = map(_number, period["motors"])
+            times.append(_time(period, times))
             motors.append((left, right))
             stale_ticks += not period["fresh"]
-            outcome = period.get("outcome") or outcome
+            outcome = _outcome(period) or outcome
             if "x" in period:
                 # A period that saw no new pose repeats the last.
                 poses.setdefault(*_parse_pose(period))
             pictures.append(read_picture(header, period, times[-1]))
             if "latency" in period:
-                latencies.append(float(period["latency"]))
-    except (ValueError, TypeError, LookupError, AttributeError) as error:
-        text = " ".join(str(error).split())  # that of a camera's settings has several lines
-        reason = f"lacks {text}" if isinstance(error, KeyError) else text
+                latencies.append(_number(period["latency"]))
+    except _ERRORS as error:
         raise UserError(
-            f"{path} is not a log of deploy/drive.py: line {number}: {reason}"
+            f"{path} is not a log of deploy/drive.py: line {number}: {_reason(error)}"
         ) from None
     if len(poses) < _LEAST_POSES:
         raise UserError(f"{path} has {len(poses)} poses: there is nothing to compare")
-    if not np.isfinite(motors).all() or not np.isfinite(times).all() or np.any(np.diff(times) < 0):
-        raise UserError(f"{path} is not a log of deploy/drive.py: its times do not ascend")
     return DriveLog(
         path=path,
         header=header,
@@ -136,19 +147,62 @@ def _parse_header(text: str) -> tuple[JsonObject, MotorModel, tuple[float, float
     calibration, goal_w = _parse_calibration(header), _parse_goal(header)
     if "image" in header:
         camera_config(header["image"])
+    # It becomes a part of the results.
+    json.dumps(header, allow_nan=False)
     return header, calibration, goal_w
+
+
+def _number(value: object, least: float = -_LARGEST, most: float = _LARGEST) -> float:
+    """Return a number of a log.
+
+    Raises:
+      ValueError: it is none, or out of bounds.
+    """
+    number = float(value)  # pyright: ignore[reportArgumentType]
+    if not least <= number <= most:
+        raise ValueError(f"{shown(value)} is not a number from {least:g} to {most:g}")
+    return number
+
+
+def _time(period: JsonObject, before: Sequence[float]) -> float:
+    """Return the time of a period [s], which comes after those before."""
+    time = _number(period["t"])
+    if before and time < before[-1]:
+        raise ValueError("its times do not ascend")
+    if before and time > before[-1] + _LONGEST_GAP:
+        raise ValueError(
+            f"it is {time - before[-1]:.3g} s after the line before, and a drive writes one at"
+            f" least every {_LONGEST_GAP:g} s"
+        )
+    return time
+
+
+def _outcome(period: JsonObject) -> str | None:
+    """Return the outcome of a drive, if a period was its last."""
+    outcome = period.get("outcome")
+    if outcome not in (None, *_OUTCOMES):
+        raise ValueError(f"outcome {shown(outcome)} is none of {', '.join(_OUTCOMES)}")
+    return outcome
+
+
+def _reason(error: Exception) -> str:
+    """Return why a line of a log cannot be read."""
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    text = " ".join(str(error).split())  # that of a camera's settings has several lines
+    return f"lacks {text}" if isinstance(error, KeyError) else text
 
 
 def _parse_pose(period: JsonObject) -> tuple[float, tuple[float, ...]]:
     """Return the time of a period's pose [s], and its x [m], y [m] and yaw [rad]."""
-    pose = tuple(float(period[name]) for name in ("x", "y", "yaw"))
-    return round(float(period["t"]) - float(period["pose_age"]), 6), pose
+    pose = tuple(_number(period[name]) for name in ("x", "y", "yaw"))
+    return round(_number(period["t"]) - _number(period["pose_age"]), 6), pose
 
 
 def _read_lines(path: Path) -> list[str]:
     try:
         with os_errors(f"{path} cannot be read"):
-            return path.read_text(encoding="utf-8").splitlines()
+            return read_text(path).splitlines()
     except UnicodeDecodeError:
         raise UserError(f"{path} is not a log of deploy/drive.py: it is not text") from None
 
@@ -157,24 +211,26 @@ def _parse_goal(header: JsonObject) -> tuple[float, float] | None:
     """Return the position of the goal; only a drive by camera may have none."""
     if header["goal"] is None and "image" in header:
         return None
-    x, y = map(float, header["goal"] or ())
-    if not np.isfinite([x, y]).all():
-        raise ValueError(f"its goal is {header['goal']}")
+    goal: Any = header["goal"]
+    try:
+        x, y = map(_number, goal)
+    except (ValueError, TypeError, ArithmeticError):
+        raise ValueError(f"its goal is {shown(header['goal'])}, not x and y [m]") from None
     return x, y
 
 
 def _parse_calibration(header: JsonObject) -> MotorModel:
     if header["format"] != FORMAT:
-        raise ValueError(f"its format is {header['format']!r}, not {FORMAT!r}")
+        raise ValueError(f"its format is {shown(header['format'])}, not {FORMAT!r}")
     values = header["calibration"]
-    left, right = (float(values[side]["dead_band"]) for side in ("left", "right"))
+    left, right = (_number(values[side]["dead_band"]) for side in ("left", "right"))
     if not max(left, right) < 1:
         raise ValueError(f"a dead-band of {max(left, right):g} leaves no speed")
     # The log has the speed of a wheel's rim [m/s].
-    rims = (float(values[side]["full_speed"]) for side in ("left", "right"))
+    rims = (_number(values[side]["full_speed"], 0.0, 100.0) for side in ("left", "right"))
     fastest_left, fastest_right = (rim / ROLLING_RADIUS for rim in rims)
     full_speed = fastest_left, fastest_right
-    return MotorModel((left, right), full_speed, lag=float(values["lag"]), delay=0.0)
+    return MotorModel((left, right), full_speed, lag=_number(values["lag"], 0.0), delay=0.0)
 
 
 def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Replay:

@@ -7,6 +7,7 @@ Orbax than this package, and installs a model viewer and a hub client.
 
 import base64
 import json
+import math
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +31,7 @@ from jetbot_mjx.deployment.numpy_policy import (
     PortablePolicy,
 )
 from jetbot_mjx.envs import NUMBERS, PIXELS
-from jetbot_mjx.errors import InvalidError, UserError
+from jetbot_mjx.errors import InvalidError, UserError, shown
 from jetbot_mjx.runs import JsonObject
 
 if TYPE_CHECKING:
@@ -88,6 +89,10 @@ def _numpy_text(about: JsonObject, numbers: str) -> str:
     return text.replace('NUMBERS = """\n"""', f'NUMBERS = """\n{numbers}\n"""')
 
 
+_MOST_PIXELS = 2**24
+"""Largest size of an image that a policy takes."""
+
+
 def _read_numpy(path: Path) -> Act:
     # An import would leave bytecode in a folder that is copied to a robot.
     return _act_of(path.read_text("utf-8"), path)
@@ -107,6 +112,24 @@ def _module_of(text: str, path: Path) -> types.ModuleType:
     return module
 
 
+def _check_shapes(shapes: Sequence[Sequence[int]], numbers: str | None = None) -> None:
+    """Check shapes before arrays are made of them, which could be of any size.
+
+    Args:
+      shapes: the shapes.
+      numbers: all their float32 numbers in base64; None: there are none.
+
+    Raises:
+      ValueError: they are no shapes, or of other numbers.
+    """
+    if not all(type(size) is int and 0 <= size < 2**24 for shape in shapes for size in shape):
+        raise ValueError(f"{shown(shapes)} are no shapes")
+    total = sum(map(math.prod, shapes))
+    most = _MOST_PIXELS if numbers is None else 3 * len(numbers.replace("\n", "")) // 16
+    if total > most:
+        raise ValueError(f"shapes of {total:,} numbers, and there are {most:,}")
+
+
 def read_exported(folder: Path) -> Policy:
     """Return an exported policy as a function of the observation, as `load_policy` does of a run.
 
@@ -122,18 +145,22 @@ def read_exported(folder: Path) -> Policy:
       UserError: the file is not such a policy.
     """
     path = folder / FORMATS["numpy"].file
-    text = runs.read_text(path)
-    about = re.search(r'json\.loads\("""(.*?)"""\)', text)
-    numbers = re.search(r'^NUMBERS = """\n([A-Za-z0-9+/=\n]*)\n"""', text, re.MULTILINE)
     try:
+        text = runs.read_text(path)
+        about = re.search(r'json\.loads\("""(.*?)"""\)', text)
+        numbers = re.search(r'^NUMBERS = """\n([A-Za-z0-9+/=\n]*)\n"""', text, re.MULTILINE)
         if about is None or numbers is None:
             raise ValueError("its numbers are missing")
         known = json.loads(about[1])
+        _check_shapes(known["shapes"], numbers[1])
+        _check_shapes([known["image"] or []])
         act = _act_of(_numpy_text(known, numbers[1]), path)
         # What is missing or does not fit shows in the first action.
         zeros = {"image": np.zeros(known["image"] or 0, np.uint8)}
         act(*(zeros.get(name, np.zeros(known["shapes"][0])) for name in known["inputs"]))
-    except (ValueError, LookupError, TypeError) as error:
+    except RecursionError:
+        raise UserError(f"{path} is not an exported policy: it is nested too deeply") from None
+    except (ValueError, LookupError, TypeError, ArithmeticError, AttributeError) as error:
         raise UserError(f"{path} is not an exported policy: {error}") from None
 
     def policy(obs: Observation, key: UInt32[Array, "2"] | None = None) -> Array:

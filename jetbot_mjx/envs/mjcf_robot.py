@@ -3,6 +3,7 @@
 Every message names what is wrong in the user's file and what would be right.
 """
 
+import warnings
 from collections.abc import Mapping
 
 import mujoco
@@ -38,9 +39,16 @@ _ONLY_IN_C = {
 }
 """Arrays of a model that MJX takes for zero, by name, with what they are in a message."""
 
+_SOLREFS = (
+    *("geom_solref", "pair_solref", "jnt_solref", "dof_solref", "eq_solref"),
+    *("tendon_solref_lim", "tendon_solref_fri"),
+)
+"""Arrays of a model whose two numbers are both above 0, or both not."""
+
 _PARTS = {"body": "body", "jnt": "joint", "geom": "geom"}
 
 _LARGEST_MASS = 1000.0  # [kg] of a small robot
+_LARGEST_LENGTH = 10_000.0  # [m]
 
 _SIZES = ("memory", "njmax", "nconmax", "nstack")
 """Sizes of MuJoCo's memory, of which the scene has its own."""
@@ -71,8 +79,10 @@ def load_spec(robot: MjcfRobotConfig) -> mujoco.MjSpec:
     try:
         spec = parse_model(robot.file, files)
         _check_joints(robot, spec)
-        model = spec.copy().compile()
-    except (ValueError, mujoco.FatalError) as error:
+        # MuJoCo warns of a model that it cannot simulate, in the middle of other lines.
+        with warnings.catch_warnings(category=UserWarning, action="error"):
+            model = spec.copy().compile()
+    except (ValueError, mujoco.FatalError, UserWarning) as error:
         raise RobotFileError(robot, f"MuJoCo refuses it: {error}") from None
     _check_numbers(robot, model)
     _check_computed(robot, model)
@@ -111,6 +121,22 @@ def _check_numbers(robot: MjcfRobotConfig, model: mujoco.MjModel) -> None:
             part, _, what = name.partition("_")
             raise RobotFileError(
                 robot, f"the {what} of a {_PARTS[part]} is infinite: give a finite number"
+            )
+    for name in ("body_pos", "jnt_pos", "geom_pos", "geom_size"):
+        if (farthest := float(np.abs(getattr(model, name)).max(initial=0.0))) > _LARGEST_LENGTH:
+            part, _, what = name.partition("_")
+            raise RobotFileError(
+                robot,
+                f"the {what} of a {_PARTS[part]} has a length of {farthest:.3g} m: lengths are in"
+                " metres (millimetres are metres × 0.001)",
+            )
+    for name in _SOLREFS:
+        first, second = (getattr(model, name) > 0.0).T
+        if np.any(first != second):
+            raise RobotFileError(
+                robot,
+                f"a {name.partition('_')[0]} has a solref of which one number is above 0 and one is"
+                " not: give two above 0, or two below",
             )
     if (mass := float(model.body_mass.sum())) > _LARGEST_MASS:
         raise RobotFileError(

@@ -80,6 +80,9 @@ def _goals_and_parts(folder: Path) -> tuple[int, frozenset[str]] | None:
         found = {**values, "rendered": (values.get("mujoco") or {}).get("rendered")}
         parts = frozenset(part for part in PARTS if found.get(part) is not None)
         return int(values["policy"]["episodes"]), parts
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except (
+        *(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError),
+        ArithmeticError,
+    ):
         # Whatever cannot be read is not worth keeping.
         return None

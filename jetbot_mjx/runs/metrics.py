@@ -99,7 +99,7 @@ class _Line(BaseModel):
     model_config = ConfigDict(strict=True, extra="allow")
     __pydantic_extra__: dict[str, _Number | None]
 
-    env_steps: Annotated[int, Field(ge=0, lt=2**53)]
+    env_steps: Annotated[int, Field(ge=0, le=2**53)]
     timestamp: Annotated[_Number, Field(ge=0, le=_LATEST)]
 
 

@@ -156,7 +156,8 @@ class WandbSink:
 
 def _read(path: Path, project: str | None) -> JsonObject:
     """Return the id and last step of this project's run, or those of a new run if there is none."""
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
+    errors = OSError, ValueError, LookupError, TypeError, RecursionError, ArithmeticError
+    with contextlib.suppress(*errors):
         progress = json.loads(read_text(path))
         if progress["project"] == project and isinstance(progress["id"], str):
             return {**progress, "env_steps": int(progress["env_steps"])}

@@ -10,4 +10,5 @@ from .lazy_imports import install_lazy_imports as install_lazy_imports
 from .output import protect_output as protect_output
 from .process import collect_garbage_late as collect_garbage_late
 from .process import exit_at_once as exit_at_once
+from .process import keep_own_files as keep_own_files
 from .process import set_environment as set_environment

@@ -43,6 +43,15 @@ def set_environment() -> None:
             os.environ.setdefault(name, value)
 
 
+def keep_own_files() -> None:
+    """Let this user read and write what the process makes, whatever the umask.
+
+    A checkpoint that its own training cannot read again is lost.
+    """
+    before = os.umask(0o077)
+    os.umask(before & 0o077)
+
+
 def exit_at_once(code: int) -> NoReturn:
     """Exit without Python's clean-up.
 

@@ -23,7 +23,7 @@ from jetbot_mjx import envs, runs
 from jetbot_mjx.agents import PPO, PolicyParams, TrainState
 from jetbot_mjx.config import Config, ConfigError
 from jetbot_mjx.envs import AdaptedEnv
-from jetbot_mjx.errors import UserError, ran_out
+from jetbot_mjx.errors import UserError, lost_device, ran_out
 from jetbot_mjx.evaluation import (
     Evaluator,
     ReturnEvaluator,
@@ -172,15 +172,31 @@ def run(
             else:
                 result = _train(training, stop or DeferredSignals(config.preemption_notice))
         except jax.errors.JaxRuntimeError as error:
-            if not ran_out(error):
+            if not (line := _explain(error, training)):
                 raise
-            each = sizes(training.ppo, training.setup.env)
-            model = MemoryModel(config, each, jax.device_count())
-            raise UserError(model.advice(device_memory())) from None
+            raise UserError(line) from None
     if distributed.is_primary():
         for fallback in fallbacks:
             runs.log_message(run_dir, f"slow: {fallback}")
     return result
+
+
+def _explain(error: Exception, training: Training) -> str:
+    """Return one line about a device that failed or is too small; nothing about other errors."""
+    if ran_out(error):
+        each = sizes(training.ppo, training.setup.env)
+        model = MemoryModel(training.config, each, jax.device_count())
+        return model.advice(device_memory())
+    if not (reason := lost_device(error)):
+        return ""
+    run_dir, folders = training.run_dir, training.run_dirs
+    saved = min((checkpoint_steps(one) or [-1])[-1] for one in folders)
+    if saved < 0:
+        return f"the device failed, and nothing was saved yet: {reason}"
+    return (
+        f"the device failed: {reason}: the training is saved after {saved:,} steps:"
+        f" `jetbot-mjx train --resume {shlex.quote(str(run_dir))}` continues it from there"
+    )
 
 
 def _compose(

@@ -44,6 +44,9 @@ _BEAT_SECONDS = 5
 _STALE_SECONDS = 30
 """Time without a heartbeat after which a worker counts as dead [s]."""
 _POLL_SECONDS = 2.0
+_PATIENCE_SECONDS = 3600
+"""Time of a round after which a worker may hang, and tells no longer that it is alive, unless one
+of its earlier rounds took a tenth of that time [s]."""
 CONFIRM_SEEDS = 5
 """Number of new seeds with which the best trials are retrained."""
 _LOCKED_SECONDS = 60
@@ -145,6 +148,7 @@ class Search:
         self._given = {one.name: _frozen(flat[one.name]) for one in space if one.name in flat}
         self._say = say
         self._batches: dict[_Static, Trials] = {}
+        self._longest_round = 0.0
         folder = folder.resolve()
         new = not folder.exists()
         make_folder(folder)
@@ -229,6 +233,7 @@ class Search:
             raise UserError(f"none of the last {count} trials could be trained, such as: {reason}")
         done, scored_by = ranked_trials(self.study), study_score(self.study)
         best = format_score(done[0].value or 0.0, scored_by) if done else "-"
+        self._longest_round = max(self._longest_round, time.perf_counter() - began)
         self._say(
             f"{len(done)} of {trials} trials, best mean {scored_by} {best};"
             f" this round of {count} took {time.perf_counter() - began:.1f} s"
@@ -365,13 +370,15 @@ class Search:
     def _alive(self) -> Iterator[list[optuna.Trial]]:
         """Tell the storage that the trials of a list are alive, from a thread.
 
-        After an error or Ctrl-C, those that are not finished are enqueued again.
+        A worker that hangs does not tell it for ever, and others then run its trials. After an
+        error or Ctrl-C, those that are not finished are enqueued again.
         """
         asked: list[optuna.Trial] = []
-        finished = threading.Event()
+        finished, began = threading.Event(), time.monotonic()
+        patience = max(_PATIENCE_SECONDS, 10 * self._longest_round)
 
         def beat() -> None:
-            while True:
+            while time.monotonic() - began < patience:
                 # The worker itself reports a storage that cannot be used.
                 with contextlib.suppress(*_STORAGE_ERRORS):
                     for trial in tuple(asked):

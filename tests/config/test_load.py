@@ -123,6 +123,9 @@ def test_the_last_override_wins_and_touches_nothing_else(write):
         ("ppo.num_envs=3=4", "ppo.num_envs = '3=4' is wrong: it should be a whole number"),
         ("ppo.num_envs=", "ppo.num_envs = None is wrong: it should be a whole number"),
         ("ppo=3", "ppo = 3 is not a section"),
+        (f"robot.file={'x' * 300}.yaml", "x.yaml cannot be read: File name too long"),
+        (f"robot.file={'x' * 300}.xml", "x.xml cannot be read: File name too long"),
+        ('robot.file="a\\0b.xml"', "cannot be read: embedded null byte"),
         ("trainer.x=1", "trainer = {'x': 1} is wrong: it should be 'resumable' or 'brax'"),
     ],
 )

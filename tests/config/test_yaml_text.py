@@ -5,6 +5,7 @@ import re
 import pytest
 
 from jetbot_mjx.config import ConfigError, load_config
+from jetbot_mjx.errors import printable
 
 BAD_YAML = {
     "key given twice": ("seed: 1\nrobot: {}\nseed: 2", 'line 3 is not valid YAML: .* "seed"'),
@@ -20,6 +21,8 @@ BAD_YAML = {
     "list": ("- 1\n- 2", r"holds \[1, 2\]: write `key: value` lines"),
     "text": ("seed 3", "holds 'seed 3': write `key: value` lines"),
     "number": ("3", "holds 3: write `key: value` lines"),
+    "deep brackets": ("a: " + "[" * 3000, "is not valid YAML: it is nested too deeply"),
+    "as many values": ("a: [" + "1," * 21_000 + "1]", "has more than 20,000 values: leave some"),
     "a model": ("\n<mujoco/>", r"mine.yaml is XML, not YAML: name a robot's model in a conf"),
 }
 
@@ -38,6 +41,8 @@ def test_a_file_that_is_no_mapping_is_refused(refusal, text, pattern):
         ("folder", "is a folder: give a YAML file"),
         ("picture.png", "cannot be read: it is not UTF-8 text"),
         ("picture.png/x.yaml", "cannot be read: Not a directory"),
+        (f"{'x' * 300}.yaml", "cannot be read: File name too long"),
+        ("a\0b.yaml", "cannot be read: embedded null byte"),
     ],
 )
 def test_a_path_that_is_no_text_file_is_refused(tmp_path, name, remedy):
@@ -45,4 +50,4 @@ def test_a_path_that_is_no_text_file_is_refused(tmp_path, name, remedy):
     (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n\x00\xff")
     with pytest.raises(ConfigError) as caught:
         load_config(tmp_path / name)
-    assert str(caught.value) == f"config {tmp_path / name} {remedy}"
+    assert str(caught.value) == printable(f"config {tmp_path / name} {remedy}")

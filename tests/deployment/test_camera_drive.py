@@ -185,6 +185,7 @@ def test_a_calibration_of_opencv_is_read_and_bends_as_the_package_unbends(tmp_pa
         (YAML.format(more="", count=2, numbers="1, x"), "lacks|could not convert"),
         (YAML.format(more="", count=1, numbers="0").replace("image_width", "w"), "image_width"),
         (YAML.format(more="", count=9, numbers="0,0,0,0,0,0,0,0,1"), "takes 8 coefficients"),
+        (YAML.format(more="", count=1, numbers="0").replace("640", "9" * 5000), "are impossible"),
         (NO_BRACKETS, r"lacks distortion_coefficients with its data in \[\.\.\.\]"),
         ("cameraResolution: [0, 0]\n" + YAML.format(more="", count=1, numbers="0"), "0 x 0 pixels"),
     ],
@@ -367,6 +368,16 @@ def test_mistakes_are_told_in_one_line(folder, arguments, said, monkeypatch, cap
         ),
         (lambda spec: spec.update(control_period=math.nan), "policy.json has control_period = nan"),
         (lambda spec: spec.update(rest_height="x"), "policy.json has rest_height = 'x': it should"),
+        (lambda spec: spec.update(rest_height=10**400), "policy.json has rest_height = 1000"),
+        (lambda spec: spec["image"].update(frames=1.5), "policy.json has image.frames = 1.5: it"),
+        (
+            lambda spec: spec["image"]["camera"].update(position=[0.0, None, 0.1]),
+            "policy.json has image.camera.position = [0.0, None, 0.1]: it should be 3 numbers",
+        ),
+        (
+            lambda spec: spec["image"]["camera"].update(lens=["pinhole"]),
+            "policy.json has image.camera.lens = ['pinhole']",
+        ),
     ],
 )
 def test_a_damaged_policy_is_told_in_one_line(folder, change, said, capsys):

@@ -728,6 +728,12 @@ def test_a_dry_run_needs_numpy_alone(exported, tmp_path):
     [
         (lambda spec: spec.pop("rest_height"), "policy.json lacks rest_height"),
         (lambda spec: spec.pop("run"), "policy.json lacks run"),
+        (lambda spec: spec["wheel_speeds"].clear(), "policy.json lacks wheel_speeds.wheel_radius"),
+        (
+            lambda spec: spec.update(rest_quaternion=[1.0, 0.0, 0.0]),
+            "policy.json has rest_quaternion = [1.0, 0.0, 0.0]: it should be 4 numbers from",
+        ),
+        (lambda spec: spec.update(observation=[["x"]]), "no list of observations with name,"),
         (lambda spec: spec.update(files={}), "has no policy.py"),
     ],
 )
@@ -744,6 +750,8 @@ def test_a_policy_that_lacks_something_is_told(change, message, exported, tmp_pa
     ("spec", "source", "message"),
     [
         ("[" * 100_000, "", "is not an exported policy: "),
+        ("3", "", "policy.json holds no object"),
+        (" " * 1_000_001, "", "policy.json is too long"),
         (None, "import no_such_package", "cannot be run here: No module named 'no_such_package'"),
     ],
 )
@@ -844,6 +852,11 @@ def test_a_log_is_told_in_metrics_and_a_plot(driven, tmp_path, capsys):
     assert (tmp_path / "drive.sim2real.png").read_bytes()[1:4] == b"PNG"
 
 
+def later(lines, **changes):
+    """The last line, changed."""
+    return json.dumps({**json.loads(lines[-1]), **changes})
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -854,6 +867,12 @@ def test_a_log_is_told_in_metrics_and_a_plot(driven, tmp_path, capsys):
         (lambda lines: [*lines[:5], '{"t": 1}', *lines[5:]], "line 6: lacks 'motors'"),
         (lambda lines: lines[:1], "has 0 poses"),
         (lambda lines: [lines[0], *lines[:0:-1]], "its times do not ascend"),
+        (lambda lines: [*lines, later(lines, t=1e3)], "a drive writes one at least every 10 s"),
+        (lambda lines: [*lines, later(lines, x=1e999)], "inf is not a number from -1e"),
+        (lambda lines: [*lines, later(lines, yaw=10**400)], "line .*: int too large"),
+        (lambda lines: [*lines, later(lines, outcome="won")], "outcome 'won' is none of"),
+        (lambda lines: [lines[0], "[" * 99_000 + "]}"], "it is nested too deeply"),
+        (lambda lines: [lines[0][:-1] + ', "a": NaN}', *lines[1:]], "line 1: Out of range"),
     ],
 )
 def test_a_bad_log_is_told(change, message, driven, tmp_path):

@@ -105,6 +105,8 @@ MOTOR = '<velocity name="fl"'
             f"<tendon>{FIXED}</tendon></mujoco>",
             "the armature of a tendon as MuJoCo does: leave it out",
         ),
+        ('size="0.05"', 'size="1e308"', "size of a geom has a length of 1e+308 m: lengths are"),
+        ('solref="0.04 1"', 'solref="-1 1"', "one number is above 0 and one is not: give two"),
         (
             "<worldbody>",
             '<option integrator="implicitfast"/><worldbody>',

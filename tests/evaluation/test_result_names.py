@@ -76,7 +76,12 @@ def test_reports_on_few_goals_keep_their_parts_too(tmp_path):
     assert report_folder(tmp_path, STEPS, 16, NONE).name == f"{STEPS}-16-goals-nominal"
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "3", "{}", '{"goal_set_version": 1}', "\udcff"])
+HUGE = f'{{"goal_set_version": {GOAL_SET_VERSION}, "policy": {{"episodes": 1e999}}}}'
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "3", "{}", '{"goal_set_version": 1}', "\udcff", HUGE]
+)
 def test_a_damaged_report_is_replaced(tmp_path, text):
     (tmp_path / STEPS).mkdir()
     (tmp_path / STEPS / "report.json").write_text(text, errors="surrogateescape")

@@ -19,7 +19,7 @@ def jobs(workflows):
 
 def test_every_workflow_is_told_to_contributors(workflows, root):
     text = (root / "CONTRIBUTING.md").read_text("utf-8")
-    assert len(workflows) == 4
+    assert len(workflows) == 5
     assert all(f"| `{name}` |" in text for name in workflows)
 
 

@@ -140,7 +140,10 @@ def test_earlier_metrics_are_logged_first(wandb, track):
     ]
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"project": "jetbots", "id": 3}', None])
+HUGE = '{"project": "jetbots", "id": "a", "env_steps": 1e999}'
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"project": "jetbots", "id": 3}', HUGE, None])
 def test_another_project_or_a_damaged_file_begins_a_run_of_its_own(wandb, track, text):
     history = [History(0, 1.0, {"a": 0.5})]
     track(history).close()

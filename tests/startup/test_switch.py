@@ -12,7 +12,7 @@ import pytest
 from jetbot_mjx import startup
 from jetbot_mjx.startup.switch import PLAIN_START
 
-ALWAYS = {"divide_cpu", "protect_output"}
+ALWAYS = {"divide_cpu", "keep_own_files", "protect_output"}
 """What `startup` exports and the switch does not turn off."""
 
 SET_BY_TESTS = {
@@ -118,3 +118,14 @@ def test_a_plain_training_and_evaluation_do_the_same(tmp_path):
 def test_the_table_has_every_trick():
     told = re.findall(r"^    ([a-z_]+) {2,}\S", startup.__doc__, re.MULTILINE)
     assert set(told) - {"trick"} == set(startup.__all__) - ALWAYS
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o777, 0o600), (0o022, 0o644), (0o400, 0o666)])
+def test_files_of_a_command_are_its_users(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        startup.keep_own_files()
+        (tmp_path / "file").write_text("x")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == mode

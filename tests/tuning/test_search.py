@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 from pathlib import Path
 
 import optuna
@@ -161,6 +162,30 @@ def test_unsupported_settings_of_trials_are_refused_before_writing(tmp_path, cha
     with pytest.raises(UserError, match=told):
         search.Search(parse_config(changes), SPACE, tmp_path / "s")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_trials_of_a_worker_that_hangs_are_run_by_another(tmp_path, monkeypatch):
+    for name, seconds in (("_STALE_SECONDS", 1), ("_BEAT_SECONDS", 1), ("_PATIENCE_SECONDS", 1.5)):
+        monkeypatch.setattr(search, name, seconds)
+    hanging, other = (search.Search(CONFIG, SPACE, tmp_path / "s") for _ in range(2))
+    released, asked = threading.Event(), threading.Event()
+
+    def hang(batch, drawn, seeds):
+        asked.set()
+        assert released.wait(60)
+        return batch.run([{"ppo.learning_rate": 1e-3}] * len(drawn), seeds)
+
+    monkeypatch.setattr(hanging, "_outcomes", hang)
+    thread = threading.Thread(target=lambda: hanging.run(2, 2))
+    thread.start()
+    assert asked.wait(60)
+    other.run(2, 2)
+    states = [trial.state for trial in other.study.trials]
+    released.set()
+    thread.join()
+    assert sorted(states) == sorted([FAIL, FAIL, COMPLETE, COMPLETE])
+    # What the first one finds in the end changes nothing.
+    assert [trial.state for trial in other.study.trials] == states
 
 
 def test_a_trial_killed_before_its_first_heartbeat_is_run_again(tmp_path, monkeypatch, capsys):

@@ -1,0 +1,309 @@
+"""Train for long and see what grows: `python benchmarks/reliability/soak.py --seconds 3600`.
+
+One process trains. At the end of every interval it notes its memory, open files, threads, the
+memory of its device, what its logs grew by, and the rate of steps. A line is fitted to each of
+them: one drifts if its slope is larger than three times its standard error, and changes it by more
+than a hundredth over the whole time. With `--kills` a second training is killed at random moments,
+by SIGKILL and SIGTERM in turn, and resumed until it ends as one that was never disturbed, again and
+again until there were so many kills.
+
+A checkpoint leaves about 7 KB in TensorStore 0.1.86, which its authors have to mend: so much growth
+of the memory an interval is told, and is no drift.
+"""
+
+import argparse
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest import mock
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.harness.results import check_output, write
+from benchmarks.reliability.torture import Process, RecoveryError, finish
+from jetbot_mjx import cli
+from jetbot_mjx.config import Config, find_config, load_config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import theme, to_png
+from jetbot_mjx.runs import write_bytes
+from jetbot_mjx.runs.metrics import METRICS
+from jetbot_mjx.runs.run_dir import versions
+from jetbot_mjx.training import session
+from jetbot_mjx.training.callbacks import Progress
+from jetbot_mjx.training.run_recorder import RunRecorder
+
+_WARM_UP = 0.25
+"""Part of the intervals, from the first on, in which caches fill and that no line is fitted to."""
+_LEAST_SAMPLES = 6
+_LARGEST_CHANGE = 0.01
+"""Change over the whole time, relative to the mean, that is no drift."""
+_CERTAIN = 3.0
+"""Standard errors that a slope has at least if it is one."""
+
+_KNOWN_SLOPES = {"memory": 10_000.0}
+"""Slopes that are known and no drift: bytes that an interval's checkpoint leaves in TensorStore."""
+
+QUANTITIES = {
+    "memory": "resident memory [bytes]",
+    "files": "open files",
+    "threads": "threads",
+    "device_memory": "memory of the device [bytes]",
+    "log": "growth of the logs [bytes]",
+    "rate": "steps per second of training",
+}
+
+
+class Sample(NamedTuple):
+    """A `Sample` holds what a process has and did at the end of an interval."""
+
+    env_steps: int
+    seconds: float
+    """Since the first sample."""
+    memory: float
+    files: float
+    threads: float
+    device_memory: float
+    """0 where the device does not tell it."""
+    log: float
+    """What the logs grew by in this interval."""
+    rate: float
+
+
+class Slope(NamedTuple):
+    """A `Slope` holds the line that was fitted to a quantity."""
+
+    quantity: str
+    mean: float
+    slope: float
+    """Change of an interval."""
+    error: float
+    """Standard error of the slope."""
+    drifts: bool
+
+
+def fit(quantity: str, values: Sequence[float]) -> Slope:
+    """Fit a line to the values of all intervals, and say whether it drifts.
+
+    Args:
+      quantity: one of `QUANTITIES`.
+      values: the values; those of the warm-up are left out.
+
+    Raises:
+      UserError: there are too few.
+    """
+    used = np.asarray(values[int(_WARM_UP * len(values)) :], float)
+    if len(used) < _LEAST_SAMPLES:
+        raise UserError(
+            f"{len(values)} intervals are too few to fit a line: train for longer, or with a"
+            " shorter checkpoint_interval"
+        )
+    at = np.arange(len(used)) - (len(used) - 1) / 2
+    mean, slope = float(used.mean()), float(at @ used / (at @ at))
+    rest = used - mean - slope * at
+    error = float(np.sqrt(rest @ rest / (len(used) - 2) / (at @ at)))
+    beyond = max(abs(slope) - _KNOWN_SLOPES.get(quantity, 0.0), 0.0)
+    is_certain = beyond > _CERTAIN * error
+    drifts = is_certain and beyond * len(used) > _LARGEST_CHANGE * abs(mean)
+    return Slope(quantity, mean, slope, error, bool(drifts))
+
+
+def watch(config: Config, run_dir: Path, seconds: float) -> list[Sample]:
+    """Train until the configuration's end or for so long, and return what was seen.
+
+    Args:
+      config: the configuration.
+      run_dir: the run folder, a new one or that of a run that is continued.
+      seconds: after this time the training ends with the interval [s].
+    """
+    samples: list[Sample] = []
+    began, size, steps = time.perf_counter(), _size_of_logs(run_dir), 0
+
+    class Recorder(RunRecorder):
+        """A recorder that notes what the process has."""
+
+        def on_interval(self, progress: Sequence[Progress]) -> bool:
+            nonlocal size, steps
+            goes_on = super().on_interval(progress)
+            one, earlier = progress[0], size
+            size, made, steps = _size_of_logs(run_dir), one.env_steps - steps, one.env_steps
+            now = time.perf_counter() - began
+            if one.seconds > 0:
+                rate = made / one.seconds
+                samples.append(Sample(steps, now, *_process(), float(size - earlier), rate))
+            return goes_on and now < seconds
+
+    with mock.patch.object(session, "RunRecorder", Recorder):
+        session.run(config, run_dir)
+    return samples
+
+
+def _process() -> tuple[float, float, float, float]:
+    """Return resident memory, open files, threads and the device's memory of this process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    stats = jax.local_devices()[0].memory_stats() or {}
+    return (
+        float(pages * os.sysconf("SC_PAGE_SIZE")),
+        float(len(os.listdir("/proc/self/fd"))),
+        float(len(os.listdir("/proc/self/task"))),
+        float(stats.get("bytes_in_use", 0)),
+    )
+
+
+def _size_of_logs(run_dir: Path) -> int:
+    files = [run_dir / METRICS, *run_dir.glob("tensorboard/*"), *run_dir.glob("*.log")]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+class Kills(NamedTuple):
+    """A `Kills` holds how often a training was killed, and what became of it."""
+
+    killed: int
+    terminated: int
+    ended: int
+    """Trainings that came to their end, each bit-identical to the one that was not disturbed."""
+
+
+def kill_often(
+    config: Path, settings: Sequence[str], folder: Path, kills: int, rng: random.Random
+) -> Kills:
+    """Kill a training at random moments and resume it until there were enough kills.
+
+    Args:
+      config: the configuration file.
+      settings: settings, as for `--set`.
+      folder: an empty folder.
+      kills: number of kills, by SIGKILL and SIGTERM in turn.
+      rng: the generator of the moments.
+
+    Raises:
+      RecoveryError: a training did not resume, or did not end as the one that was not disturbed.
+    """
+    began = time.monotonic()
+    wanted = finish(folder / "undisturbed", settings, config=config)
+    longest, run_dir = time.monotonic() - began, folder / "killed"
+    counts, ended = {signal.SIGKILL: 0, signal.SIGTERM: 0}, 0
+    while (done := sum(counts.values())) < kills:
+        number = signal.SIGKILL if done % 2 == 0 else signal.SIGTERM
+        with Process(run_dir, settings, config=config) as process:
+            time.sleep(rng.uniform(0.0, longest))
+            process.send(number)
+            process.wait()
+        if "Traceback" in process.stderr:
+            raise RecoveryError(f"after {number.name} it printed:\n{process.stderr}")
+        counts[number] += 1
+        # Now and then to the end, so that many are compared; and after the last kill.
+        if rng.random() < 0.2 or done + 1 == kills:
+            if finish(run_dir, settings, config=config) != wanted:
+                raise RecoveryError(f"{run_dir} ended otherwise than {folder / 'undisturbed'}")
+            ended += 1
+            shutil.rmtree(run_dir)
+    return Kills(counts[signal.SIGKILL], counts[signal.SIGTERM], ended)
+
+
+def plot(samples: Sequence[Sample], slopes: Sequence[Slope]) -> Figure:
+    """Plot every quantity over the time, and the line that was fitted to it."""
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    hours = np.array([one.seconds for one in samples]) / 3600
+    for axes, slope in zip(figure.subplots(3, 2).flat, slopes, strict=True):
+        values = np.array([getattr(one, slope.quantity) for one in samples])
+        first = int(_WARM_UP * len(samples))
+        at = np.arange(len(samples) - first) - (len(samples) - first - 1) / 2
+        axes.plot(hours, values, ".", markersize=3)
+        axes.plot(hours[first:], slope.mean + slope.slope * at, color="C1")
+        title = QUANTITIES[slope.quantity] + (": drifts" if slope.drifts else "")
+        axes.set(title=title, xlabel="time [h]", ylim=(0, None))
+        axes.grid(visible=True)
+    return figure
+
+
+def _table(slopes: Sequence[Slope]) -> str:
+    lines = [f"{'':32}{'mean':>16}{'an interval':>16}{'error':>14}"]
+    for one in slopes:
+        numbers = f"{one.mean:16,.1f}{one.slope:+16,.2f}{one.error:14,.2f}"
+        lines.append(f"{QUANTITIES[one.quantity]:32}{numbers}{'  drifts' * one.drifts}")
+    return "\n".join(lines)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = cli.Parser(description=__doc__)
+    parser.add_argument("--config", default="smoke", help="configuration (default: smoke)")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--run-dir", type=Path, help="run folder (default: one that is removed)")
+    parser.add_argument("--seconds", type=float, default=600, help="longest time (default: 600)")
+    parser.add_argument("--kills", type=int, default=0, help="number of kills (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the moments of the kills")
+    parser.add_argument("--output", type=Path, help="JSON file; a plot is written beside it")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Train, print what drifts, and write the JSON file and the plot.
+
+    Args:
+      arguments: The command line without the program's name; None: that of the process.
+
+    Returns:
+      0, or 1 if something drifts or a killed training did not recover.
+    """
+    options = _parser().parse_args(arguments)
+    if options.output:
+        check_output(options.output)
+    # A run of the configuration's own length would end after seconds.
+    longest = [] if any("num_timesteps" in x for x in options.overrides) else ["1e15"]
+    settings = [*options.overrides, *(f"ppo.num_timesteps={one}" for one in longest)]
+    config = load_config(options.config, settings)
+    values: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as place:
+        samples = watch(config, options.run_dir or Path(place) / "run", options.seconds)
+        slopes = [fit(name, [getattr(one, name) for one in samples]) for name in QUANTITIES]
+        print(f"{len(samples)} intervals, {samples[-1].env_steps:,} steps")
+        print(_table(slopes))
+        if options.kills:
+            values["kills"] = _kill(options, Path(place))
+    values |= _as_json(config, samples, slopes)
+    if options.output:
+        write(options.output, values)
+        with theme("light"):
+            write_bytes(options.output.with_suffix(".png"), to_png(plot(samples, slopes)))
+    is_lost = "failure" in values.get("kills", {})
+    return int(is_lost or any(one.drifts for one in slopes))
+
+
+def _kill(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Kill a training as often as asked for; return what became of it as JSON."""
+    file = find_config(options.config)
+    rng = random.Random(options.seed)
+    try:
+        done = kill_often(file, options.overrides, folder, options.kills, rng)
+    except RecoveryError as error:
+        print(f"a killed training did not recover: {error}")
+        return {"failure": str(error)}
+    print(f"killed {done.killed} times, terminated {done.terminated} times: bit-identical")
+    return done._asdict()
+
+
+def _as_json(
+    config: Config, samples: Sequence[Sample], slopes: Sequence[Slope]
+) -> Mapping[str, Any]:
+    return {
+        "device": jax.devices()[0].device_kind,
+        "versions": versions(),
+        "config": config.model_dump(mode="json"),
+        "slopes": [one._asdict() for one in slopes],
+        "samples": [one._asdict() for one in samples],
+    }
+
+
+if __name__ == "__main__":
+    cli.run_command(main)
