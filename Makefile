@@ -11,7 +11,7 @@ STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 SB3_STAMP := $(VENV)/.installed-sb3
 
-.PHONY: setup sb3 train test test-gpu test-slow check notebooks format benchmark docs wasm wheel clean
+.PHONY: setup sb3 train test test-gpu test-slow check notebooks format benchmark docs wasm wheel release-check clean
 
 setup: $(STAMP)
 
@@ -104,6 +104,16 @@ wheel: $(STAMP)
 	$(USE) train obstacle --run-dir runs/obstacle --set ppo.num_timesteps=131_072
 	.cache/wheel/venv/bin/python -m pytest -p no:cacheprovider --numprocesses 2 --dist loadfile \
 		tests/end_to_end/test_kernels_are_on.py tests/onekernel/test_lower_jaxpr.py tests/viewers/test_viser_server.py
+
+# What would be released, in dist/: complete for PyPI, and small. Nothing is uploaded.
+release-check: $(STAMP)
+	rm -rf dist
+	$(BIN)/python -m hatchling build -d dist
+	$(PYTHON) -m venv .cache/twine
+	.cache/twine/bin/python -m pip install --quiet twine
+	.cache/twine/bin/python -m twine check --strict dist/*
+	@$(PYTHON) -c 'import pathlib, sys; [wheel] = pathlib.Path("dist").glob("*.whl"); size = wheel.stat().st_size / 1e6; \
+		print(f"{wheel}: {size:.1f} MB"); sys.exit(size > 8 and "error: the wheel is larger than 8 MB")'
 
 clean:
 	rm -rf $(VENV) .cache site

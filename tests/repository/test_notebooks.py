@@ -2,6 +2,9 @@
 
 import importlib.util
 import re
+import shutil
+import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -147,10 +150,25 @@ def test_the_first_cell_installs_what_is_not_there(read, name, monkeypatch):
     assert typed == []
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert "name a SOURCE" in str(shell.run_cell(code.source).error_in_exec)
-    for source, package in (("https://host/x.git", "git+https://host/x.git"), ("x.whl", "x.whl")):
-        named = code.source.replace('SOURCE = ""', f'SOURCE = "{source}"')
-        assert shell.run_cell(named).success
-        assert typed.pop() == f"install --quiet {package}"
+    for gpu, extra in ((None, ""), ("/usr/bin/nvidia-smi", "[cuda]")):
+        monkeypatch.setattr(shutil, "which", lambda name, gpu=gpu: gpu)
+        for source, package in (
+            ("https://host/x.git", f"jetbot_mjx{extra}@git+https://host/x.git"),
+            ("x.whl", f"x.whl{extra}"),
+        ):
+            named = code.source.replace('SOURCE = ""', f'SOURCE = "{source}"')
+            assert shell.run_cell(named).success
+            assert typed.pop() == f"install --quiet {package}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_in_colab_the_first_cell_looks_for_a_gpu(read, name, monkeypatch, capsys):
+    assert "colab-badge.svg)](https://colab.research.google.com/" in read[name].cells[0].source
+    monkeypatch.setitem(sys.modules, "google.colab", types.ModuleType("google.colab"))
+    for gpu, told in ((None, "no GPU here: all of it works, but slower"), ("nvidia-smi", "")):
+        monkeypatch.setattr(shutil, "which", lambda name, gpu=gpu: gpu)
+        assert InteractiveShell().run_cell(read[name].cells[1].source).success
+        assert capsys.readouterr().out.partition(";")[0] == told
 
 
 def test_every_notebook_is_tested(root):
