@@ -213,32 +213,35 @@ def to_json(config: Config, settings: Settings, best: Found, baseline: Episodes)
     }
 
 
-def read(path: Path) -> list[dict[str, Any]]:
+def read(path: Path, file_format: str = FORMAT) -> list[dict[str, Any]]:
     """Return the searches in a file; an empty list if there is no file.
 
+    Args:
+      path: The file.
+      file_format: The format that the file states.
+
     Raises:
-      UserError: The file is not one of best-known times.
+      UserError: The file is of another format.
     """
     if not path.exists():
         return []
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-        if values["format"] != FORMAT:
+        if values["format"] != file_format:
             raise ValueError(values["format"])
         return list(values["searches"])
     except (OSError, ValueError, LookupError, TypeError):
-        raise UserError(
-            f"--output {path} is not a file of best-known times: name another"
-        ) from None
+        what = "best-known times" if file_format == FORMAT else file_format.split("/")[0]
+        raise UserError(f"--output {path} is not a file of {what}: name another") from None
 
 
-def store(path: Path, search: dict[str, Any]) -> None:
+def store(path: Path, search: dict[str, Any], file_format: str = FORMAT) -> None:
     """Write a search into the file; it replaces an earlier one for the same settings.
 
     Raises:
-      UserError: The file cannot be written, or is not one of best-known times.
+      UserError: The file cannot be written, or is of another format.
     """
-    others = [one for one in read(path) if one["settings"] != search["settings"]]
+    others = [one for one in read(path, file_format) if one["settings"] != search["settings"]]
     searches = sorted([*others, search], key=lambda one: json.dumps(one["settings"]))
     # One line for each key: with the usual indentation the lists would take thousands of lines.
     texts = [
@@ -249,7 +252,7 @@ def store(path: Path, search: dict[str, Any]) -> None:
     ]
     body = ",\n  ".join(texts)
     with writing_to(path):
-        write_text(path, f'{{\n "format": "{FORMAT}",\n "searches": [\n  {body}\n ]\n}}\n')
+        write_text(path, f'{{\n "format": "{file_format}",\n "searches": [\n  {body}\n ]\n}}\n')
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -53,14 +53,31 @@ def find(config: Config, episodes: Episodes) -> Float[np.ndarray, " n"] | str:
     Returns:
       The number of environment steps to each goal, or in one line why there are no times.
     """
+    return look_up(FILE, "search", config, episodes)
+
+
+def look_up(
+    file: Path, kind: str, config: Config, episodes: Episodes
+) -> Float[np.ndarray, " n"] | str:
+    """Find numbers of steps to the goals on which a policy was evaluated.
+
+    Args:
+      file: the file with the numbers for some settings.
+      kind: what they were computed by.
+      config: the configuration of the policy's run.
+      episodes: the policy's episodes on the first goals of the report, with arrays on the host.
+
+    Returns:
+      The number of environment steps to each goal, or in one line why there are none.
+    """
     # Choose the search whose settings differ least from this configuration's.
     searches = [
         one
-        for one in json.loads(FILE.read_text(encoding="utf-8"))["searches"]
+        for one in json.loads(file.read_text(encoding="utf-8"))["searches"]
         if one["goal_set_version"] == GOAL_SET_VERSION
     ]
     if not searches:
-        return "no search was made for these goals"
+        return f"no {kind} was made for these goals"
     ours = settings_of(config)
 
     def differing(search: JsonObject) -> list[str]:
@@ -70,12 +87,12 @@ def find(config: Config, episodes: Episodes) -> Float[np.ndarray, " n"] | str:
     if names := differing(search):
         stated = ", ".join(f"{name} = {search['settings'][name]}" for name in names)
         own = ", ".join(str(ours[name]) for name in names)
-        return f"the search was made for {stated}, and this run has {own}"
+        return f"the {kind} was made for {stated}, and this run has {own}"
     # Check that the search covers exactly these goals.
     count = episodes.steps.size
     goals, steps = np.asarray(search["goals"], float) / 1e3, np.asarray(search["steps"], float)
     if len(steps) < count:
-        return f"the search covers {len(steps):,} of these {count:,} goals"
+        return f"the {kind} covers {len(steps):,} of these {count:,} goals"
     if np.abs(goals[:count] - episodes.goal_w[:, :2]).max() > _GOAL_TOLERANCE:
-        return "the search was made for goals at other positions"
+        return f"the {kind} was made for goals at other positions"
     return steps[:count]

@@ -20,7 +20,7 @@ from jetbot_mjx.evaluation.moments import MomentFinder
 from jetbot_mjx.evaluation.report import (
     Report,
     by_goal,
-    compare_with_best_known,
+    compare_times,
     find_failures,
     learning_curve,
     losses,
@@ -355,7 +355,6 @@ class _Reporter:
         # Run the fixed goals, which most parts of the report are computed from.
         self._build(checkpoint, setup, ranges)
         finished = jax.device_get(self._nominal.run(checkpoint.params, self._keys))
-        best_known, missing = compare_with_best_known(config, finished)
         run_dir = runs.shortened(checkpoint.run_dir)
         history = runs.read_history(checkpoint.run_dir / runs.METRICS)
         report = Report(
@@ -376,8 +375,7 @@ class _Reporter:
             ranges=ranges if ranges.drawn else None,
             ranges_file=None if self._ranges_file is None else Path(self._ranges_file),
             changes=runs.changes_since_the_run_before(checkpoint.run_dir),
-            best_known=best_known,
-            best_known_missing=missing,
+            **compare_times(config, finished),
             seen=self._moments.find(checkpoint.params, self._keys, finished)
             if self._moments
             else (),

@@ -8,13 +8,13 @@ import math
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jetbot_mjx.config import Config, RandomizationConfig
-from jetbot_mjx.evaluation import best_known
+from jetbot_mjx.evaluation import best_known, lower_bound
 from jetbot_mjx.evaluation.clips import Clip
 from jetbot_mjx.evaluation.evaluator import Summary, final_distances, json_values, success_and_time
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
@@ -165,6 +165,10 @@ class Report(NamedTuple):
     """Best-known times; None if there are none for these goals and settings."""
     best_known_missing: str | None = None
     """Why there are no best-known times."""
+    lower_bound: BestKnown | None = None
+    """Times below which no controller reaches the goals; None if there are none, like above."""
+    lower_bound_missing: str | None = None
+    """Why there is no such bound."""
     seen: tuple[SeenEpisode, ...] = ()
     """The images that the policy saw in some episodes; empty if it does not see."""
     clips: tuple[Clip, ...] = ()
@@ -289,7 +293,32 @@ def compare_with_best_known(
     Returns:
       The comparison and None, or None and the reason why there is no comparison.
     """
-    steps = best_known.find(config, episodes)
+    return _compare(config, episodes, best_known.find(config, episodes))
+
+
+def compare_with_lower_bound(
+    config: Config, episodes: Episodes
+) -> tuple[BestKnown | None, str | None]:
+    """Compare a policy's times with the bound below them, as `compare_with_best_known` does."""
+    return _compare(config, episodes, lower_bound.find(config, episodes))
+
+
+def compare_times(config: Config, episodes: Episodes) -> dict[str, Any]:
+    """Return a report's fields with both comparisons, by name."""
+    known, unknown = compare_with_best_known(config, episodes)
+    bound, unbounded = compare_with_lower_bound(config, episodes)
+    return {
+        "best_known": known,
+        "best_known_missing": unknown,
+        "lower_bound": bound,
+        "lower_bound_missing": unbounded,
+    }
+
+
+def _compare(
+    config: Config, episodes: Episodes, steps: Float[np.ndarray, " n"] | str
+) -> tuple[BestKnown | None, str | None]:
+    """Compare a policy's times with numbers of steps to the same goals."""
     if isinstance(steps, str):
         return None, steps
     best = steps * config.physics.ctrl_dt

@@ -25,7 +25,7 @@ def summarize_report(report: Report | ReturnReport) -> str:
     text = (
         f"{_count(report.policy.episodes, 'fixed goal')} (set {GOAL_SET_VERSION}), policy after"
         f" {report.env_steps:,} steps\n{policies_table({'policy': report})}\n"
-        f"{best_known_lines(report)}{robustness_table(report)}"
+        f"{best_known_lines(report)}{lower_bound_line(report)}{robustness_table(report)}"
         f"report: {report.folder / 'report.html'}"
     )
     if fuller := fuller_report(report.folder, report.checkpoint.name):
@@ -140,6 +140,19 @@ def best_known_lines(report: Report) -> str:
         f"{abs(best.total.gap):.2%} {'slower' if best.total.gap >= 0 else 'faster'} than best known"
         f" (mean of {best.total.reached:,} goals: {best.total.policy_mean:.3f} s, best known"
         f" {best.total.best_mean:.3f} s)\n  by the goal's bearing: {directions}\n"
+    )
+
+
+def lower_bound_line(report: Report) -> str:
+    """Return a line with a policy's gap to the bound below all times, or why there is none."""
+    bound = report.lower_bound
+    if bound is None:
+        return f"what physics allows: not known, {report.lower_bound_missing}\n"
+    if bound.total.gap is None:
+        return ""
+    return (
+        f"within {bound.total.gap:.2%} of what physics allows (no controller reaches the same goals"
+        f" in less than {bound.total.best_mean:.3f} s on average)\n"
     )
 
 

@@ -1,0 +1,179 @@
+"""The limits of a robot's motion hold in drives by other commands than they were measured with."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jetbot_mjx.config import load_config
+from jetbot_mjx.envs import make_jetbot_env
+from jetbot_mjx.evaluation import lower_bound
+from jetbot_mjx.evaluation.drive_limits import (
+    MARGIN,
+    MARGIN_OF_SPEED,
+    Inertia,
+    Motion,
+    drive,
+    inertia,
+    measure,
+    motion,
+    path,
+    random_actions,
+    sides,
+)
+from jetbot_mjx.evaluation.lower_bound import Grid, Limits, farthest, least_steps
+
+CONFIGS = {"isaac": "jetbot", "real": "real_jetbot"}
+
+
+def test_actions_are_actions_of_all_kinds():
+    actions = random_actions(3, 64, 50)
+    assert actions.shape == (64, 50, 2)
+    assert np.abs(actions).max() <= 1
+    assert (np.abs(actions[::4]) == 1).all()
+    np.testing.assert_array_equal(actions, random_actions(3, 64, 50))
+
+
+def test_motion_is_in_the_frame_of_the_robot():
+    # A robot that looks to the left, drives ahead, slides to its left and turns.
+    half = np.sqrt(0.5)
+    qpos, qvel = np.zeros((1, 1, 9)), np.zeros((1, 1, 8))
+    qpos[..., :7] = 1.0, 2.0, 0.03, half, 0.0, 0.0, half
+    qvel[..., :6] = -0.2, 0.7, 0.0, 0.0, 0.0, 1.5
+    moved = motion(qpos, qvel)
+    assert moved.speed.item() == pytest.approx(0.7)
+    assert moved.sideways.item() == pytest.approx(0.2)
+    assert moved.yaw_rate.item() == pytest.approx(1.5)
+    assert moved.position.ravel().tolist() == [1.0, 2.0, 0.03]
+
+
+def test_the_inertia_of_the_jetbot():
+    robot = load_config("jetbot").robot
+    found = inertia(make_jetbot_env("jetbot"))
+    _, spin, across = robot.moments_of_wheel
+    turning = 2 * (spin + robot.armature) / robot.wheel_radius**2
+    half = robot.wheel_separation / 2
+    heavy = robot.chassis_mass + 2 * robot.wheel_mass + turning
+    round_ = (
+        robot.moments_of_chassis[2]
+        + robot.chassis_mass * robot.chassis_com[0] ** 2
+        + 2 * (across + robot.wheel_mass * half**2)
+        + turning * half**2
+    )
+    moment = -robot.chassis_mass * robot.chassis_com[0]
+    by_hand = round_ / (heavy * half), moment / round_, moment / heavy, half
+    # The model's wheels are pressed a little into the floor.
+    np.testing.assert_allclose(found, by_hand, rtol=0.03)
+
+
+def test_a_car_has_none():
+    assert inertia(make_jetbot_env("car")) == "the robot has no wheels on two sides"
+
+
+def test_without_torque_neither_side_grows():
+    constants, dt = Inertia(0.05, 4.0, 0.013, 0.06), 0.01
+    v, w = [0.5], [-3.0]
+    for _ in range(20):
+        v, w = (
+            [*v, v[-1] - constants.drag * w[-1] ** 2 * dt],
+            [*w, w[-1] * (1 + constants.swing * v[-1] * dt)],
+        )
+    zeros = np.zeros((1, 21))
+    moved = Motion(np.zeros((1, 21, 3)), np.array([v]), zeros, np.array([w]))
+    np.testing.assert_allclose(sides(constants, moved, dt), 0, atol=1e-12)
+    # Torque of the right wheel alone: in a turn to the right that is the inner one.
+    w = np.array([w])
+    w[0, 1:] += 0.1
+    outer, inner = sides(constants, moved._replace(yaw_rate=w, speed=np.array([v])), dt)
+    assert (outer[0, 0], inner[0, 0]) == (pytest.approx(-0.005), pytest.approx(0.005))
+
+
+def test_a_path_follows_from_speeds_and_yaw_rates():
+    limits = Limits(0.01, 0.05, 0.03, 1, 0, 0, 1, 0, 3, 0, 3, 0.06, 9.0, 0.5, 0.02, 0.0)
+    time = np.arange(101) * 0.01
+    v, w = np.full((1, 101), 0.6), np.full((1, 101), 2.0)
+    moved = Motion(np.zeros((1, 101, 3)), v, np.zeros((1, 101)), w)
+    turn, aside = 2.0 * time, 0.02 * 0.6 * 2.0 / 2.0
+    x = 0.3 * np.sin(turn) + aside * (1 - np.cos(turn))
+    y = 0.3 * (1 - np.cos(turn)) - aside * np.sin(turn)
+    np.testing.assert_allclose(path(moved, limits)[0], np.stack([x, y], axis=1), atol=1e-4)
+
+
+# In the simulator.
+
+
+def _stored(preset):
+    values = json.loads(lower_bound.FILE.read_text())["searches"]
+    one = next(one for one in values if one["settings"]["robot.preset"] == preset)
+    return Limits(**one["limits"]), one["reach"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", CONFIGS)
+def test_other_drives_keep_to_the_limits_and_never_beat_the_bound(preset):
+    env, steps = make_jetbot_env(load_config(CONFIGS[preset])), 150
+    limits, reach = _stored(preset)
+    driven = drive(env, random_actions(77, 2048, steps))
+    found = measure(env, driven)
+    assert found.step / MARGIN <= limits.step
+    assert found.brake * found.step / MARGIN**2 <= limits.brake * limits.step
+    assert found.motor_yaw_rate / MARGIN <= limits.motor_yaw_rate
+    assert found.max_speed / MARGIN_OF_SPEED <= limits.max_speed
+    assert found.max_wheel_speed / MARGIN_OF_SPEED <= limits.max_wheel_speed
+    assert found.min_speed / MARGIN >= limits.min_speed
+    assert found.error / 1.2 <= limits.error
+    # On this floor and two others, to 2,048 goals, by the fastest of all drives.
+    table = farthest(limits, steps, Grid(1, 90))
+    rng = np.random.default_rng(5)
+    distance, bearing = rng.uniform(0.15, 1.2, 2048), rng.uniform(-np.pi, np.pi, 2048)
+    goals = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=1)
+    least = least_steps(table, goals, reach)
+    for friction in (1.0, 0.4, 1.5):
+        one = (
+            env
+            if friction == 1.0
+            else make_jetbot_env(load_config(CONFIGS[preset], [f"robot.friction={friction}"]))
+        )
+        moved = driven if friction == 1.0 else drive(one, random_actions(78, 1024, steps))
+        fastest = np.full(len(goals), steps + 1)
+        for place in moved.position[..., :2]:
+            near = np.linalg.norm(place[:, None] - goals, axis=-1) < reach
+            fastest = np.minimum(
+                fastest, np.where(near.any(axis=0), near.argmax(axis=0), steps + 1)
+            )
+        reached = fastest <= steps
+        assert reached.mean() > 0.5
+        assert (fastest >= least)[reached].all()
+
+
+@pytest.mark.slow
+def test_optimised_commands_do_not_beat_the_bound():
+    """The cross-entropy method pulls polylines of actions farthest along a few directions."""
+    env, steps, knots = make_jetbot_env("jetbot"), 80, 10
+    limits, _ = _stored("isaac")
+    table = farthest(limits, steps, Grid(1, 72))
+    first, rng = env.reset(jax.random.PRNGKey(0)).pipeline_state, np.random.default_rng(0)
+
+    @jax.jit
+    @jax.vmap
+    def end(actions):
+        def step(state, action):
+            return env.physics.step(state, env.drive.controls(env.wheel_targets(action))), None
+
+        return jax.lax.scan(step, first, actions)[0].qpos[:2]
+
+    places = np.linspace(0, knots - 1, steps)
+    hats = np.maximum(1 - np.abs(places[:, None] - np.arange(knots)), 0)
+    for direction in range(0, 72, 9):
+        angle = 2 * np.pi * direction / 72
+        mean, spread = np.zeros((knots, 2)), np.ones((knots, 2))
+        for _ in range(12):
+            drawn = mean + spread * rng.standard_normal((512, knots, 2))
+            ends = np.asarray(end(jnp.asarray(hats @ drawn, jnp.float32)))
+            far = ends @ [np.cos(angle), np.sin(angle)]
+            best = drawn[np.argsort(-far)[:32]]
+            mean, spread = best.mean(axis=0), np.maximum(best.std(axis=0), 0.02)
+            assert far.max() <= table[steps, direction]
+        assert far.max() > 0.6 * table[steps, direction] - 0.1

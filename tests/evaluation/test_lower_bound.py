@@ -1,0 +1,198 @@
+"""No controller is faster than the bound, be it of the abstract motion or of the simulator."""
+
+import json
+
+import numpy as np
+import pytest
+
+from helpers.reports import make_episodes, make_report
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.evaluation import best_known, lower_bound
+from jetbot_mjx.evaluation.lower_bound import (
+    ERROR_TIME,
+    Grid,
+    Limits,
+    farthest,
+    find,
+    least_steps,
+)
+from jetbot_mjx.evaluation.report import compare_with_lower_bound
+from jetbot_mjx.evaluation.tables import lower_bound_line
+
+PLAIN = Limits(
+    ctrl_dt=1 / 30,
+    track=0.05,
+    step=0.06,
+    brake=1.0,
+    swing=0.0,
+    drag=0.0,
+    max_speed=0.6,
+    min_speed=0.0,
+    motor_yaw_rate=3.0,
+    growth=0.0,
+    max_yaw_rate=3.0,
+    half_track=0.06,
+    max_wheel_speed=np.inf,
+    lateness=0.75,
+    slip=0.0,
+    error=0.0,
+)
+SPINNING = PLAIN._replace(
+    swing=4.0,
+    drag=0.013,
+    brake=1.3,
+    growth=1.5,
+    max_yaw_rate=5.5,
+    slip=0.02,
+    max_wheel_speed=0.8,
+)
+STEPS = 40
+
+
+def places(limits: Limits, v: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return the positions (time, n, 2) of speeds and yaw rates (time, n)."""
+    late, dt, ones = limits.lateness, limits.ctrl_dt, np.ones((1, v.shape[1]))
+    heading = np.cumsum(
+        np.concatenate([0 * ones, dt * ((1 - late) * w[:-1] + late * w[1:])]), axis=0
+    )
+    cos, sin, aside = np.cos(heading), np.sin(heading), -limits.slip * v * w
+    velocity = np.stack([v * cos - aside * sin, v * sin + aside * cos], axis=-1)
+    moves = dt * ((1 - late) * velocity[:-1] + late * velocity[1:])
+    return np.concatenate([np.zeros((1, v.shape[1], 2)), np.cumsum(moves, axis=0)])
+
+
+def motions(limits: Limits, seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return speeds and yaw rates (time, n) that keep to the limits: turn, then drive, or wander.
+
+    Each robot wants a yaw rate and a speed, which it changes at random times, and gets as much of
+    both as the limits allow, the turn first.
+    """
+    rng, dt, g = np.random.default_rng(seed), limits.ctrl_dt, limits.track
+    v, w, all_v, all_w = np.zeros(count), np.zeros(count), [], []
+    begins, ends = rng.integers(0, STEPS, (2, count))
+    side, slow = rng.choice([-1.0, 1.0], count), rng.uniform(0, 1, count)
+    wanders = rng.uniform(size=count) < 0.5
+    turn, fast = side * limits.motor_yaw_rate, np.zeros(count)
+    for t in range(STEPS + 1):
+        all_v.append(v)
+        all_w.append(w)
+        again = wanders & (rng.uniform(size=count) < 0.1)
+        turn = np.where(again, rng.uniform(-1, 1, count) * limits.motor_yaw_rate, turn)
+        turn = np.where(~wanders & (t >= ends), 0, turn)
+        fast = np.where(wanders | (t >= begins), 1, slow * (slow > 0.7)) * limits.max_speed
+        drift_w = limits.swing * v * w * dt
+        drift_v = -limits.drag * w**2 * dt
+        most = limits.step / g
+        nw = w + drift_w + np.clip(turn - w - drift_w, -most, most)
+        left = limits.step - g * np.abs(nw - w - drift_w)
+        fast = np.minimum(fast, limits.max_wheel_speed - limits.half_track * np.abs(nw))
+        nv = v + drift_v + np.clip(fast - v - drift_v, -left, left)
+        nv = np.clip(nv, 0, None)
+        v, w = nv, nw
+    return np.stack(all_v), np.stack(all_w)
+
+
+@pytest.mark.parametrize("limits", [PLAIN, SPINNING], ids=["plain", "spinning"])
+@pytest.mark.parametrize("grid", [Grid(1, 48), Grid(2, 36)], ids=["coarse", "finer"])
+def test_no_motion_within_the_limits_gets_farther(limits, grid):
+    table = farthest(limits, STEPS, grid)
+    angles = np.arange(grid.headings) * 2 * np.pi / grid.headings
+    directions = np.stack([np.cos(angles), np.sin(angles)])
+    most = np.full_like(table, -1.0)
+    for seed in range(4):
+        reached = places(limits, *motions(limits, seed, 4096)) @ directions
+        most = np.maximum(most, reached.max(axis=1))
+    assert (most <= table + 1e-9).all()
+    # They are not far from it, so that a bound which is too low would be found.
+    assert (table - most)[-1].max() < 0.18
+
+
+def test_straight_ahead_it_is_the_time_of_full_acceleration():
+    table = farthest(PLAIN, STEPS, Grid(2, 72))
+    time = np.arange(STEPS + 1)
+    speed = np.minimum(PLAIN.step * time, PLAIN.max_speed)
+    exact = PLAIN.ctrl_dt * (np.cumsum(speed) - (1 - PLAIN.lateness) * speed)
+    assert (table[:, 0] >= exact).all()
+    assert table[-1, 0] <= 1.03 * exact[-1]
+
+
+def test_backwards_takes_the_time_of_the_turn():
+    table = farthest(PLAIN, STEPS, Grid(2, 72))
+    # A quarter of a turn at 3 rad/s, less what the lattice and the drift of speed give away.
+    steps = np.flatnonzero(table[:, 36] > 0.02)[0]
+    assert steps * PLAIN.ctrl_dt > 0.95 * np.pi / 2 / PLAIN.motor_yaw_rate
+
+
+def test_an_error_of_the_positions_is_added():
+    table = farthest(PLAIN, 4, Grid(1, 8))
+    more = farthest(PLAIN._replace(error=0.01), 4, Grid(1, 8))
+    time = np.arange(1, 5) * PLAIN.ctrl_dt + ERROR_TIME
+    np.testing.assert_allclose(
+        (more - table)[1:], np.broadcast_to(0.01 * time[:, None], (4, 8)), rtol=1e-4
+    )
+
+
+def test_steps_to_a_goal():
+    # Ahead 0.1 m a step, nowhere else.
+    table = np.array([[0.1 * t, 0, 0, 0] for t in range(6)])
+    goals = np.array([[0.05, 0.0], [0.15, 0.0], [0.45, 0.0], [0.0, 0.09], [0.0, 0.3]])
+    assert least_steps(table, goals, 0.1).tolist() == [0, 1, 4, 0, 6]
+
+
+# What the package stores.
+
+
+def stored():
+    return json.loads(lower_bound.FILE.read_text())["searches"]
+
+
+def test_no_search_is_faster():
+    known = {
+        json.dumps(one["settings"]): one
+        for one in json.loads(best_known.FILE.read_text())["searches"]
+    }
+    bounds = {json.dumps(one["settings"]): one for one in stored()}
+    assert known.keys() == bounds.keys()
+    for name, bound in bounds.items():
+        assert bound["goals"] == known[name]["goals"]
+        gaps = np.array(known[name]["steps"]) / np.array(bound["steps"]) - 1
+        assert gaps.min() >= 0
+        assert np.median(gaps) < 0.1
+
+
+@pytest.mark.parametrize("preset", ["isaac", "real"])
+def test_a_report_compares_with_it(preset):
+    bound = next(one for one in stored() if one["settings"]["robot.preset"] == preset)
+    config = parse_config(
+        {"robot": {"preset": preset}, "task": {"max_speed": bound["settings"]["task.max_speed"]}}
+    )
+    goals = np.array(bound["goals"][:16]) / 1e3
+    steps = np.array(bound["steps"][:16])
+    episodes = make_episodes(goals, np.ones(16))._replace(steps=1.1 * steps)
+    np.testing.assert_array_equal(find(config, episodes), steps)
+    found, _ = compare_with_lower_bound(config, episodes)
+    assert found is not None
+    assert found.total.gap == pytest.approx(0.1)
+
+
+def test_another_robot_has_none():
+    config = parse_config({"robot": {"friction": 0.5}})
+    goals = np.array(stored()[0]["goals"][:4]) / 1e3
+    found, reason = compare_with_lower_bound(config, make_episodes(goals, np.ones(4)))
+    assert found is None
+    assert reason is not None
+    assert "the bound was made for robot.preset = isaac, and this run has isaac with" in reason
+
+
+def test_the_line_says_how_far_the_policy_is_from_it():
+    bound = next(one for one in stored() if one["settings"]["robot.preset"] == "isaac")
+    goals, steps = np.array(bound["goals"][:16]) / 1e3, np.array(bound["steps"][:16])
+    report = make_report(make_episodes(goals, np.ones(16))._replace(steps=1.1 * steps))
+    found, _ = compare_with_lower_bound(report.config, report.episodes)
+    mean = steps.mean() / 60
+    assert lower_bound_line(report._replace(lower_bound=found)) == (
+        "within 10.00% of what physics allows (no controller reaches the same goals in less than"
+        f" {mean:.3f} s on average)\n"
+    )
+    line = lower_bound_line(report._replace(lower_bound_missing="no bound"))
+    assert line == "what physics allows: not known, no bound\n"
