@@ -365,8 +365,8 @@ def test_no_kind_of_command_is_left_out():
     covered = {"train", "evaluate", "render", "replay", "play", "plan", "export", "sim2real"}
     covered |= {"new_task", "new_env", "check_env", "new_robot", "check_robot", "pretrained"}
     covered.add("jetbot_mjx")
-    # Tested by test_list_configs.py, test_list_runs.py and test_tune.py.
-    covered |= {"configs", "runs", "tune"}
+    # Tested by test_list_configs.py, test_list_runs.py, test_share.py and test_tune.py.
+    covered |= {"configs", "runs", "tune", "share"}
     for text, (_, words) in DOCUMENTED.items():
         bare = [word for word in words if not re.fullmatch(r"[A-Z_]+=.*", word)]
         if bare[:2] == ["python", "-m"] and bare[2] != "pytest":
