@@ -130,6 +130,7 @@ MISTYPED = {
     "plan": [],
     "tune": ["smoke"],
     "export": ["runs/mine", "--format", "torch"],
+    "share": ["runs/mine"],
     "sim2real": ["log", "--delay", "x"],
     "replay": [],
     "pretrained": ["--all"],
