@@ -2,12 +2,15 @@
 
 import json
 import sys
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jetbot_mjx.evaluation import best_known, lower_bound
-from jetbot_mjx.evaluation.lower_bound import Grid, Limits, farthest
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.learning.reachable import Grid, Limits, farthest
+from jetbot_mjx.evaluation.best_known import BOUND_FILE, FILE
 
 TIMES = (0.5, 1.0, 1.5)  # [s]
 GRID = Grid(1, 72)
@@ -31,9 +34,7 @@ def outline(table: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    bound, known = (
-        of_isaac(json.loads(one.FILE.read_text())["searches"]) for one in (lower_bound, best_known)
-    )
+    bound, known = (of_isaac(json.loads(one.read_text())["searches"]) for one in (BOUND_FILE, FILE))
     limits = Limits(**bound["limits"])
     table = farthest(limits, round(max(TIMES) / limits.ctrl_dt), GRID)
     goals = np.array(bound["goals"]) / 1e3

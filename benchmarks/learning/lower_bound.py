@@ -18,19 +18,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import CONFIGS
 from benchmarks.harness.results import check_output
 from benchmarks.learning.best_known import read, store
+from benchmarks.learning.drive_limits import drive, highest, measure, random_actions
+from benchmarks.learning.reachable import Grid, farthest, least_steps
 from jetbot_mjx import cli
 from jetbot_mjx.config import load_config
 from jetbot_mjx.devices import require_device, use_compilation_cache
 from jetbot_mjx.envs.jetbot_env import make_jetbot_env
 from jetbot_mjx.envs.task import reach_on_floor
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation.best_known import FILE as BEST_KNOWN
-from jetbot_mjx.evaluation.best_known import settings_of
-from jetbot_mjx.evaluation.drive_limits import drive, highest, measure, random_actions
+from jetbot_mjx.evaluation.best_known import BOUND_FILE, FILE, settings_of
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
-from jetbot_mjx.evaluation.lower_bound import FILE, FORMAT, Grid, farthest, least_steps
 from jetbot_mjx.runs.run_dir import versions
+
+_FORMAT = "jetbot_mjx-lower-bound/1"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -53,13 +54,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ("headings", Grid().headings, "headings on the circle"),
     ):
         parser.add_argument(f"--{name}", type=cli.positive_int, default=value, help=what)
-    parser.add_argument("--output", type=Path, default=FILE)
+    parser.add_argument("--output", type=Path, default=BOUND_FILE)
     options = parser.parse_args(arguments)
     require_device()
     use_compilation_cache()
     config = load_config(options.config, options.overrides)
     check_output(options.output)
-    read(options.output, FORMAT)
+    read(options.output, _FORMAT)
     env = make_jetbot_env(config)
     # Measure the limits, and the distance within which goals are reached.
     actions = random_actions(0, options.drives, options.steps, env.action_size)
@@ -86,10 +87,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "goals": np.rint(1e3 * goals).astype(int).tolist(),
         "steps": steps.astype(int).tolist(),
     }
-    for known in (one for one in read(BEST_KNOWN) if one["settings"] == stored["settings"]):
+    for known in (one for one in read(FILE) if one["settings"] == stored["settings"]):
         gaps = np.array(known["steps"][: len(steps)]) / np.maximum(steps, 1) - 1
         print(f"best known: {np.median(gaps):.2%} longer in the median, {gaps.min():.2%} at least")
-    store(options.output, stored, FORMAT)
+    store(options.output, stored, _FORMAT)
     print(f"results: {options.output}")
     return 0
 

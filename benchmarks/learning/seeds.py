@@ -29,7 +29,7 @@ from jetbot_mjx import cli, evaluation, training
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.config.yaml_text import read_yaml
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation.report import compare_with_best_known
+from jetbot_mjx.evaluation.report import compare_with
 from jetbot_mjx.runs import Setup, load_checkpoint
 from jetbot_mjx.runs.run_dir import versions, write_json
 
@@ -59,7 +59,7 @@ def measure(config: Config, fresh: int) -> dict[str, Any]:
         seeds = []
         for checkpoint in checkpoints:
             fixed = jax.device_get(evaluator.run(checkpoint.params, fixed_keys))
-            best_known, missing = compare_with_best_known(config, fixed)
+            best_known, missing = compare_with("search", config, fixed)
             unseen = jax.device_get(evaluator.run(checkpoint.params, fresh_keys))
             failed = np.asarray(unseen.goal_w)[np.asarray(unseen.success) == 0][:, :2]
             seeds.append(

@@ -1,13 +1,15 @@
-"""Look up the best-known time to each of the report's goals, as a reference for a policy's time.
+"""Look up the best-known time to each of the report's goals, and a bound below it.
 
-The file in the package holds the results of `benchmarks/learning/best_known.py`. It searches
-commands for each goal with the true model and executes them open-loop, so their time is an upper
-bound of the shortest time. Each search states the settings for which it is valid; there are no
-times for any other task, robot or time step.
+The files in the package hold the results of `benchmarks/learning/best_known.py`, which searches
+commands for each goal with the true model and executes them open-loop, so that their time is an
+upper bound of the shortest time, and of `benchmarks/learning/lower_bound.py`, which computes from
+the limits of the robot's motion a time in which no controller reaches the goal. Each result states
+the settings for which it is valid; there are no times for any other task, robot or time step.
 """
 
 import json
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -17,10 +19,13 @@ from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs import JsonObject
 
-FILE = Path(__file__).parents[1] / "assets" / "best_known.json"
+_ASSETS = Path(__file__).parents[1] / "assets"
+FILE, BOUND_FILE = _ASSETS / "best_known.json", _ASSETS / "lower_bound.json"
+
+Kind = Literal["search", "bound"]
 
 FORMAT = "jetbot_mjx-best-known/1"
-"""Format of that file."""
+"""Format of the first of these files."""
 
 SETTINGS = (
     "task.name",
@@ -43,27 +48,11 @@ def settings_of(config: Config) -> JsonObject:
     return {"robot.preset": config.robot.label, **{name: flat[name] for name in SETTINGS}}
 
 
-def find(config: Config, episodes: Episodes) -> Float[np.ndarray, " n"] | str:
-    """Find the best-known times to the goals on which a policy was evaluated.
-
-    Args:
-      config: the configuration of the policy's run.
-      episodes: the policy's episodes on the first goals of the report, with arrays on the host.
-
-    Returns:
-      The number of environment steps to each goal, or in one line why there are no times.
-    """
-    return look_up(FILE, "search", config, episodes)
-
-
-def look_up(
-    file: Path, kind: str, config: Config, episodes: Episodes
-) -> Float[np.ndarray, " n"] | str:
+def find(kind: Kind, config: Config, episodes: Episodes) -> Float[np.ndarray, " n"] | str:
     """Find numbers of steps to the goals on which a policy was evaluated.
 
     Args:
-      file: the file with the numbers for some settings.
-      kind: what they were computed by.
+      kind: what they were computed by: a search, or as a bound of them.
       config: the configuration of the policy's run.
       episodes: the policy's episodes on the first goals of the report, with arrays on the host.
 
@@ -71,6 +60,7 @@ def look_up(
       The number of environment steps to each goal, or in one line why there are none.
     """
     # Choose the search whose settings differ least from this configuration's.
+    file = FILE if kind == "search" else BOUND_FILE
     searches = [
         one
         for one in json.loads(file.read_text(encoding="utf-8"))["searches"]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jetbot_mjx.config import Config, RandomizationConfig
-from jetbot_mjx.evaluation import best_known, lower_bound
+from jetbot_mjx.evaluation import best_known
 from jetbot_mjx.evaluation.clips import Clip
 from jetbot_mjx.evaluation.evaluator import Summary, final_distances, json_values, success_and_time
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
@@ -281,44 +281,29 @@ def _sectors(bearing: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     return np.floor((bearing + width / 2) / width).astype(int) % SECTORS
 
 
-def compare_with_best_known(
-    config: Config, episodes: Episodes
+def compare_times(config: Config, episodes: Episodes) -> dict[str, Any]:
+    """Return a report's fields that compare its times with the best known and with the bound."""
+    fields = {}
+    kinds: Mapping[str, best_known.Kind] = {"best_known": "search", "lower_bound": "bound"}
+    for name, kind in kinds.items():
+        fields[name], fields[f"{name}_missing"] = compare_with(kind, config, episodes)
+    return fields
+
+
+def compare_with(
+    kind: best_known.Kind, config: Config, episodes: Episodes
 ) -> tuple[BestKnown | None, str | None]:
-    """Compare a policy's times with the best-known times.
+    """Compare a policy's times with the best-known times, or with the bound below them.
 
     Args:
+      kind: which of them, as for `best_known.find`.
       config: the configuration of the policy's run.
       episodes: the policy's episodes on the first goals of the report, with arrays on the host.
 
     Returns:
       The comparison and None, or None and the reason why there is no comparison.
     """
-    return _compare(config, episodes, best_known.find(config, episodes))
-
-
-def compare_with_lower_bound(
-    config: Config, episodes: Episodes
-) -> tuple[BestKnown | None, str | None]:
-    """Compare a policy's times with the bound below them, as `compare_with_best_known` does."""
-    return _compare(config, episodes, lower_bound.find(config, episodes))
-
-
-def compare_times(config: Config, episodes: Episodes) -> dict[str, Any]:
-    """Return a report's fields with both comparisons, by name."""
-    known, unknown = compare_with_best_known(config, episodes)
-    bound, unbounded = compare_with_lower_bound(config, episodes)
-    return {
-        "best_known": known,
-        "best_known_missing": unknown,
-        "lower_bound": bound,
-        "lower_bound_missing": unbounded,
-    }
-
-
-def _compare(
-    config: Config, episodes: Episodes, steps: Float[np.ndarray, " n"] | str
-) -> tuple[BestKnown | None, str | None]:
-    """Compare a policy's times with numbers of steps to the same goals."""
+    steps = best_known.find(kind, config, episodes)
     if isinstance(steps, str):
         return None, steps
     best = steps * config.physics.ctrl_dt

@@ -16,9 +16,9 @@ from jetbot_mjx.evaluation import best_known
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.html_report import write_report
-from jetbot_mjx.evaluation.report import SECTORS, compare_with_best_known
+from jetbot_mjx.evaluation.report import SECTORS, compare_with
 from jetbot_mjx.evaluation.rollout import rollout_fn
-from jetbot_mjx.evaluation.tables import best_known_lines, policies_table
+from jetbot_mjx.evaluation.tables import best_known_lines, lower_bound_line, policies_table
 
 DT = 1 / 60
 CONFIG = parse_config({})
@@ -58,12 +58,12 @@ def searched(tmp_path, monkeypatch):
 def test_times_of_the_same_goals_and_settings_are_found(searched):
     searched()
     searched({"robot": {"preset": "real"}}, steps=(STEPS * 3).tolist())
-    known = best_known.find(CONFIG, make_episodes(GOALS, np.ones(8)))
+    known = best_known.find("search", CONFIG, make_episodes(GOALS, np.ones(8)))
     np.testing.assert_array_equal(known, STEPS)
-    first = best_known.find(CONFIG, make_episodes(GOALS[:3], np.ones(3)))
+    first = best_known.find("search", CONFIG, make_episodes(GOALS[:3], np.ones(3)))
     np.testing.assert_array_equal(first, STEPS[:3])
     real = parse_config({"robot": {"preset": "real"}})
-    slow = best_known.find(real, make_episodes(GOALS, np.ones(8)))
+    slow = best_known.find("search", real, make_episodes(GOALS, np.ones(8)))
     np.testing.assert_array_equal(slow, STEPS * 3)
 
 
@@ -84,7 +84,7 @@ def test_elsewhere_the_reason_is_told(searched, settings, episodes, missing):
     searched()
     goals = polar(np.full(episodes, 1.0), np.arange(episodes) * 45.0)
     driven = make_episodes(goals, np.ones(episodes))
-    found, reason = compare_with_best_known(parse_config(settings), driven)
+    found, reason = compare_with("search", parse_config(settings), driven)
     assert found is None
     assert missing in reason
 
@@ -96,16 +96,16 @@ def test_runs_with_other_observations_and_hyperparameters_are_comparable(searche
         "ppo": {"discounting": 0.9},
         "physics": {"iterations": 7},
     }
-    known = best_known.find(parse_config(settings), make_episodes(GOALS, np.ones(8)))
+    known = best_known.find("search", parse_config(settings), make_episodes(GOALS, np.ones(8)))
     np.testing.assert_array_equal(known, STEPS)
 
 
 def test_other_goals_have_no_known_times(searched):
     searched(goals=np.rint(1000 * GOALS + [0, 3]).astype(int).tolist())
     driven = make_episodes(GOALS, np.ones(8))
-    assert "goals at other positions" in best_known.find(CONFIG, driven)
+    assert "goals at other positions" in best_known.find("search", CONFIG, driven)
     searched(goal_set_version=GOAL_SET_VERSION + 1)
-    assert "no search was made for these goals" in best_known.find(CONFIG, driven)
+    assert "no search was made for these goals" in best_known.find("search", CONFIG, driven)
 
 
 # A policy's gap.
@@ -115,7 +115,7 @@ def test_the_gap_is_that_of_the_means_over_the_goals_reached(searched):
     searched()
     won = np.array([1, 1, 0, 1, 1, 0, 1, 1])
     driven = make_episodes(GOALS, won, steps=STEPS + np.arange(8))
-    found, reason = compare_with_best_known(CONFIG, driven)
+    found, reason = compare_with("search", CONFIG, driven)
     assert reason is None
     assert found.time_to_goal_median == pytest.approx(63.5 * DT)
     reached = np.flatnonzero(won)
@@ -135,7 +135,7 @@ def test_the_gap_is_that_of_the_means_over_the_goals_reached(searched):
 def test_a_report_tells_it_in_all_its_forms(searched, tmp_path):
     searched()
     driven = make_episodes(GOALS, [1, 1, 0, 1, 1, 1, 1, 1], steps=STEPS + 6, **RECORDED)
-    found, _ = compare_with_best_known(CONFIG, driven)
+    found, _ = compare_with("search", CONFIG, driven)
     report = make_report(driven)._replace(
         folder=tmp_path / "report", best_known=found, versions=VERSIONS
     )
@@ -172,7 +172,7 @@ def test_a_report_tells_it_in_all_its_forms(searched, tmp_path):
 def test_a_report_without_it_says_why(searched, tmp_path):
     searched({"robot": {"preset": "real"}})
     driven = make_episodes(GOALS, np.ones(8), **RECORDED)
-    found, missing = compare_with_best_known(CONFIG, driven)
+    found, missing = compare_with("search", CONFIG, driven)
     report = make_report(driven)._replace(
         folder=tmp_path / "report", best_known_missing=missing, versions=VERSIONS
     )
@@ -188,10 +188,55 @@ def test_a_report_without_it_says_why(searched, tmp_path):
 
 def test_a_policy_that_reaches_nothing_has_no_gap(searched):
     searched()
-    found, _ = compare_with_best_known(CONFIG, make_episodes(GOALS, np.zeros(8)))
+    found, _ = compare_with("search", CONFIG, make_episodes(GOALS, np.zeros(8)))
     assert found.total == (-180.0, 180.0, 0, None, None, None)
     report = make_report(make_episodes(GOALS, np.zeros(8)))._replace(best_known=found)
     assert "reached no goal" in best_known_lines(report)
+
+
+# The bound below them.
+
+
+def bounds():
+    return json.loads(best_known.BOUND_FILE.read_text())["searches"]
+
+
+@pytest.mark.parametrize("preset", ["isaac", "real"])
+def test_a_report_compares_with_it(preset):
+    bound = next(one for one in bounds() if one["settings"]["robot.preset"] == preset)
+    config = parse_config(
+        {"robot": {"preset": preset}, "task": {"max_speed": bound["settings"]["task.max_speed"]}}
+    )
+    goals = np.array(bound["goals"][:16]) / 1e3
+    steps = np.array(bound["steps"][:16])
+    episodes = make_episodes(goals, np.ones(16))._replace(steps=1.1 * steps)
+    np.testing.assert_array_equal(best_known.find("bound", config, episodes), steps)
+    found, _ = compare_with("bound", config, episodes)
+    assert found is not None
+    assert found.total.gap == pytest.approx(0.1)
+
+
+def test_another_robot_has_none():
+    config = parse_config({"robot": {"friction": 0.5}})
+    goals = np.array(bounds()[0]["goals"][:4]) / 1e3
+    found, reason = compare_with("bound", config, make_episodes(goals, np.ones(4)))
+    assert found is None
+    assert reason is not None
+    assert "the bound was made for robot.preset = isaac, and this run has isaac with" in reason
+
+
+def test_the_line_says_how_far_the_policy_is_from_it():
+    bound = next(one for one in bounds() if one["settings"]["robot.preset"] == "isaac")
+    goals, steps = np.array(bound["goals"][:16]) / 1e3, np.array(bound["steps"][:16])
+    report = make_report(make_episodes(goals, np.ones(16))._replace(steps=1.1 * steps))
+    found, _ = compare_with("bound", report.config, report.episodes)
+    mean = steps.mean() / 60
+    assert lower_bound_line(report._replace(lower_bound=found)) == (
+        "within 10.00% of what physics allows (no controller reaches the same goals in less than"
+        f" {mean:.3f} s on average)\n"
+    )
+    line = lower_bound_line(report._replace(lower_bound_missing="no bound"))
+    assert line == "what physics allows: not known, no bound\n"
 
 
 # The file of the package, and the search.
@@ -213,7 +258,7 @@ def test_its_goals_are_the_reports():
         config = load_config(None, overrides)
         count = len(search["steps"])
         goals = jax.vmap(Gliding(config).reset)(report_keys(count)).goal[:, :2]
-        known = best_known.find(config, make_episodes(goals, np.ones(count)))
+        known = best_known.find("search", config, make_episodes(goals, np.ones(count)))
         np.testing.assert_array_equal(known, search["steps"])
 
 

@@ -1,8 +1,8 @@
-"""Compute a lower bound of the time to a goal, from limits of a robot's motion.
+"""Bound how far a robot gets in a time, from the limits of its motion.
 
 The bound holds for every controller, as long as the robot's motion keeps its `Limits`; the page
-`docs/lower-bound.md` states the theorem and its proof. `benchmarks/learning/lower_bound.py`
-measures the limits of a robot and stores the bound for the report's goals in the package.
+`docs/lower-bound.md` states the theorem and its proof. `lower_bound.py` computes from it the least
+number of steps to each of the report's goals.
 
 With the speed v and the yaw rate ω of a robot, p = v + g ω and q = v - g ω behave like the speeds
 of its right and left wheels: each changes by at most `step` in a control step, besides a drift that
@@ -11,20 +11,10 @@ that a robot can get in a given direction in a given time. A goal that is farthe
 direction, less the success radius, is not reached.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-
-from jetbot_mjx.config import Config
-from jetbot_mjx.evaluation.best_known import look_up
-from jetbot_mjx.evaluation.rollout import Episodes
-
-FILE = Path(__file__).parents[1] / "assets" / "lower_bound.json"
-
-FORMAT = "jetbot_mjx-lower-bound/1"
-"""Format of that file."""
 
 ERROR_TIME = 0.25
 """[s] Time before the start from which `Limits.error` counts."""
@@ -336,16 +326,3 @@ def _within(
     ahead: Float[np.ndarray, "n directions"], reach: Float[np.ndarray, " directions"]
 ) -> Bool[np.ndarray, " n"]:
     return np.all(ahead <= reach, axis=1)
-
-
-def find(config: Config, episodes: Episodes) -> Float[np.ndarray, " n"] | str:
-    """Find the stored bounds of the times to the goals on which a policy was evaluated.
-
-    Args:
-      config: the configuration of the policy's run.
-      episodes: the policy's episodes on the first goals of the report, with arrays on the host.
-
-    Returns:
-      The least number of environment steps to each goal, or in one line why there is none.
-    """
-    return look_up(FILE, "bound", config, episodes)

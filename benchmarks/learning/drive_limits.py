@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
+from benchmarks.learning.reachable import ERROR_TIME, Limits
 from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ, DifferentialDrive, JetBotEnv, PhysicsState
-from jetbot_mjx.evaluation.lower_bound import ERROR_TIME, Limits
 
 MARGIN = 1.02
 """Factor between the largest measured value and the limit."""

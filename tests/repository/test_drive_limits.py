@@ -7,10 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jetbot_mjx.config import load_config
-from jetbot_mjx.envs import make_jetbot_env
-from jetbot_mjx.evaluation import lower_bound
-from jetbot_mjx.evaluation.drive_limits import (
+from benchmarks.learning.drive_limits import (
     MARGIN,
     MARGIN_OF_SPEED,
     Inertia,
@@ -23,7 +20,10 @@ from jetbot_mjx.evaluation.drive_limits import (
     random_actions,
     sides,
 )
-from jetbot_mjx.evaluation.lower_bound import Grid, Limits, farthest, least_steps
+from benchmarks.learning.reachable import Grid, Limits, farthest, least_steps
+from jetbot_mjx.config import load_config
+from jetbot_mjx.envs import make_jetbot_env
+from jetbot_mjx.evaluation.best_known import BOUND_FILE
 
 CONFIGS = {"isaac": "jetbot", "real": "real_jetbot"}
 
@@ -105,7 +105,7 @@ def test_a_path_follows_from_speeds_and_yaw_rates():
 
 
 def _stored(preset):
-    values = json.loads(lower_bound.FILE.read_text())["searches"]
+    values = json.loads(BOUND_FILE.read_text())["searches"]
     one = next(one for one in values if one["settings"]["robot.preset"] == preset)
     return Limits(**one["limits"]), one["reach"]
 

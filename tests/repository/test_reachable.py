@@ -5,19 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from helpers.reports import make_episodes, make_report
-from jetbot_mjx.config import parse_config
-from jetbot_mjx.evaluation import best_known, lower_bound
-from jetbot_mjx.evaluation.lower_bound import (
-    ERROR_TIME,
-    Grid,
-    Limits,
-    farthest,
-    find,
-    least_steps,
-)
-from jetbot_mjx.evaluation.report import compare_with_lower_bound
-from jetbot_mjx.evaluation.tables import lower_bound_line
+from benchmarks.learning.reachable import ERROR_TIME, Grid, Limits, farthest, least_steps
+from jetbot_mjx.evaluation.best_known import BOUND_FILE, FILE
 
 PLAIN = Limits(
     ctrl_dt=1 / 30,
@@ -142,57 +131,16 @@ def test_steps_to_a_goal():
 # What the package stores.
 
 
-def stored():
-    return json.loads(lower_bound.FILE.read_text())["searches"]
+def stored(file):
+    searches = json.loads(file.read_text())["searches"]
+    return {json.dumps(one["settings"]): one for one in searches}
 
 
 def test_no_search_is_faster():
-    known = {
-        json.dumps(one["settings"]): one
-        for one in json.loads(best_known.FILE.read_text())["searches"]
-    }
-    bounds = {json.dumps(one["settings"]): one for one in stored()}
+    known, bounds = stored(FILE), stored(BOUND_FILE)
     assert known.keys() == bounds.keys()
     for name, bound in bounds.items():
         assert bound["goals"] == known[name]["goals"]
         gaps = np.array(known[name]["steps"]) / np.array(bound["steps"]) - 1
         assert gaps.min() >= 0
         assert np.median(gaps) < 0.1
-
-
-@pytest.mark.parametrize("preset", ["isaac", "real"])
-def test_a_report_compares_with_it(preset):
-    bound = next(one for one in stored() if one["settings"]["robot.preset"] == preset)
-    config = parse_config(
-        {"robot": {"preset": preset}, "task": {"max_speed": bound["settings"]["task.max_speed"]}}
-    )
-    goals = np.array(bound["goals"][:16]) / 1e3
-    steps = np.array(bound["steps"][:16])
-    episodes = make_episodes(goals, np.ones(16))._replace(steps=1.1 * steps)
-    np.testing.assert_array_equal(find(config, episodes), steps)
-    found, _ = compare_with_lower_bound(config, episodes)
-    assert found is not None
-    assert found.total.gap == pytest.approx(0.1)
-
-
-def test_another_robot_has_none():
-    config = parse_config({"robot": {"friction": 0.5}})
-    goals = np.array(stored()[0]["goals"][:4]) / 1e3
-    found, reason = compare_with_lower_bound(config, make_episodes(goals, np.ones(4)))
-    assert found is None
-    assert reason is not None
-    assert "the bound was made for robot.preset = isaac, and this run has isaac with" in reason
-
-
-def test_the_line_says_how_far_the_policy_is_from_it():
-    bound = next(one for one in stored() if one["settings"]["robot.preset"] == "isaac")
-    goals, steps = np.array(bound["goals"][:16]) / 1e3, np.array(bound["steps"][:16])
-    report = make_report(make_episodes(goals, np.ones(16))._replace(steps=1.1 * steps))
-    found, _ = compare_with_lower_bound(report.config, report.episodes)
-    mean = steps.mean() / 60
-    assert lower_bound_line(report._replace(lower_bound=found)) == (
-        "within 10.00% of what physics allows (no controller reaches the same goals in less than"
-        f" {mean:.3f} s on average)\n"
-    )
-    line = lower_bound_line(report._replace(lower_bound_missing="no bound"))
-    assert line == "what physics allows: not known, no bound\n"
