@@ -5,6 +5,7 @@
 - Tables in pages that hold `<!-- table: NAME -->`: those of quantities that may differ come from
   `QUANTITIES` and the shipped files, that of JAX's primitives from `onekernel`.
 - `api/ROOM.md`: The public names and the modules of each room come from its folder.
+- Each page as Markdown beside its HTML, where the links of `llms.txt` lead.
 
 Nothing of this is written by hand.
 """
@@ -411,6 +412,15 @@ def on_files(files: Any, *, config: Any) -> Any:
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Put the tables into a page; MkDocs calls this."""
     return with_tables(markdown)
+
+
+def on_post_build(*, config: Any) -> None:
+    """Write the pages as Markdown beside their HTML; MkDocs calls this."""
+    docs, site = Path(__file__).parent, Path(config["site_dir"])
+    for path in docs.rglob("*.md"):
+        text = with_tables(path.read_text("utf-8"))
+        (site / path.relative_to(docs)).write_text(text, encoding="utf-8")
+    (site / PAGE).write_text(page(), encoding="utf-8")
 
 
 if __name__ == "__main__":

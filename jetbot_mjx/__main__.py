@@ -4,11 +4,13 @@
 A command is imported only if it is chosen, so that the list is printed at once.
 """
 
+import argparse
 import runpy
 import sys
 from collections.abc import Mapping, Sequence
 
 from jetbot_mjx import __version__, cli
+from jetbot_mjx.config import shipped_folder
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "train": ("train", "train a policy into a run folder"),
@@ -34,7 +36,13 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 
 
 def _parser() -> cli.Parser:
-    parser = cli.Parser(prog=cli.PROGRAM, description="Train a JetBot to drive to goals.")
+    pages = shipped_folder("docs") / "llms.txt"
+    parser = cli.Parser(
+        prog=cli.PROGRAM,
+        description="Train a JetBot to drive to goals.",
+        epilog=f"for coding assistants: {str(pages).replace('%', '%%')}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,  # the path stays in one piece
+    )
     parser.add_argument("--version", action="version", version=f"jetbot_mjx {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND [--help]")
     for name, (_, text) in COMMANDS.items():

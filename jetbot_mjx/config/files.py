@@ -12,7 +12,7 @@ def shipped_folder(name: str) -> Path:
     """Return a folder of the repository that a wheel holds inside the package.
 
     Args:
-      name: `configs`, `examples`, or a folder in them.
+      name: `configs`, `docs`, `examples`, or a folder in them.
     """
     package = Path(__file__).parents[1]
     return next(

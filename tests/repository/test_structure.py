@@ -282,7 +282,7 @@ def test_all_that_is_needed_is_shipped(tmp_path):
     assert wheel.stat().st_size <= 8_000_000
     shipped = set(zipfile.ZipFile(wheel).namelist())
     tracked = subprocess.run(
-        ["git", "ls-files", PACKAGE, ENGINE, "configs", "examples"],
+        ["git", "ls-files", PACKAGE, ENGINE, "configs", "examples", "docs/*.md", "docs/llms.txt"],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -294,7 +294,7 @@ def test_all_that_is_needed_is_shipped(tmp_path):
     for package in (PACKAGE, ENGINE):
         assert f"{package}/__init__.pyi" in shipped
     assert f"{ENGINE}/cpu/xla_call.ll" in shipped
-    assert not any("__pycache__" in name for name in shipped)
+    assert not any("__pycache__" in name or "docs/jetbot.gif" in name for name in shipped)
 
 
 @pytest.mark.parametrize("name", [x for x in FILES if x.startswith(f"{PACKAGE}.")])
