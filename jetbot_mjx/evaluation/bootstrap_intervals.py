@@ -27,6 +27,15 @@ class Estimate(NamedTuple):
     """Lower end of the interval; None, like `high`, if no interval can be given."""
     high: float | None = None
 
+    def told(self, form: str) -> str:
+        """Return the value and its interval as text, each in a format such as `{:.2%}`."""
+        if self.value is None:
+            return "-"
+        text = form.format(self.value)
+        if self.low is None or self.high is None:
+            return text
+        return f"{text} ({form.format(self.low)} .. {form.format(self.high)})"
+
 
 def mean_difference(
     a: Float[np.ndarray, "*n"], b: Float[np.ndarray, "*m"], axis: int = -1

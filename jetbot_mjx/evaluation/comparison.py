@@ -8,22 +8,31 @@ that comparison holds only for these policies, not for other trainings.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import scipy.stats
 from jaxtyping import Bool, Float
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, shown
 from jetbot_mjx.evaluation import bootstrap_intervals as intervals
 from jetbot_mjx.evaluation.bootstrap_intervals import Estimate, bootstrap
+from jetbot_mjx.evaluation.curves import CurvePoint, band
 from jetbot_mjx.evaluation.evaluator import Summary, json_values
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
-from jetbot_mjx.evaluation.report import CurvePoint, Report
+from jetbot_mjx.evaluation.report import Report
 from jetbot_mjx.runs import JsonObject, shortened
+
+
+class _OfSeeds(Protocol):
+    @property
+    def seeds(self) -> Mapping[str, Any]: ...
+
+
+_Run = TypeVar("_Run", bound=_OfSeeds)
 
 
 class Aggregate(NamedTuple):
@@ -69,6 +78,14 @@ class PairwiseResult(NamedTuple):
     p: float
     """p-value of the exact two-sided binomial test that wins and losses are equally likely."""
 
+    def told(self, form: str, what: str) -> str:
+        """Return the result as text; of differences in a format, and wins on `what`."""
+        return (
+            f"difference {self.difference.told(form)},"
+            f" improvement {self.improvement.told('{:.0%}')},"
+            f" {what} {self.wins} : {self.losses} (p {self.p:.2g})"
+        )
+
 
 class Pair(NamedTuple):
     """A `Pair` compares two runs with each other."""
@@ -106,23 +123,55 @@ class Comparison(NamedTuple):
 
     def to_json(self) -> JsonObject:
         """Return everything except the episodes as JSON values."""
-        values = {name: value for name, value in self._asdict().items() if name != "folder"}
-        values["runs"] = [_run_json(run) for run in self.runs]
-        return json_values({"goal_set_version": GOAL_SET_VERSION, **values})
+        return comparison_json(self._asdict(), "policy", "mujoco")
 
 
-def _run_json(run: Run) -> JsonObject:
-    seeds = [
+def comparison_json(values: JsonObject, *of_each_seed: str) -> JsonObject:
+    """Return a comparison as JSON values.
+
+    Args:
+      values: the fields of the comparison.
+      of_each_seed: the fields of each seed's report to keep.
+    """
+    runs = [
         {
-            "name": name,
-            "checkpoint": report.checkpoint.name,
-            "env_steps": report.env_steps,
-            "policy": report.policy,
-            "mujoco": report.mujoco,
+            **run._asdict(),
+            "seeds": [
+                {
+                    "name": name,
+                    "checkpoint": report.checkpoint.name,
+                    "env_steps": report.env_steps,
+                    **{field: getattr(report, field) for field in of_each_seed},
+                }
+                for name, report in run.seeds.items()
+            ],
         }
-        for name, report in run.seeds.items()
+        for run in values["runs"]
     ]
-    return {**run._asdict(), "seeds": seeds}
+    kept = {name: value for name, value in values.items() if name != "folder"}
+    return json_values({"goal_set_version": GOAL_SET_VERSION, **kept, "runs": runs})
+
+
+def common_fields(
+    folder: Path, runs: Sequence[_Run], pair: Callable[[_Run, _Run], object]
+) -> JsonObject:
+    """Return the fields of a comparison that both kinds have, by name.
+
+    Args:
+      folder: the folder for the files of the comparison.
+      runs: the results of each run.
+      pair: a function that compares two of them.
+    """
+    firsts = [next(iter(run.seeds.values())) for run in runs]
+    return {
+        "folder": folder,
+        "episodes": firsts[0].policy.episodes,
+        "runs": tuple(runs),
+        "pairs": tuple(pair(a, b) for a, b in itertools.combinations(runs, 2)),
+        "differences": differing_settings([one.config for one in firsts]),
+        "baselines": firsts[0].baselines,
+        "versions": firsts[0].versions,
+    }
 
 
 def check_comparable(configs: Mapping[str, Config]) -> None:
@@ -136,13 +185,27 @@ def check_comparable(configs: Mapping[str, Config]) -> None:
     Raises:
       UserError: the runs differ in the task, the robot, or the duration of an episode.
     """
-    (first, wanted), *others = ((name, _task_settings(config)) for name, config in configs.items())
+    settings = {name: _task_settings(config) for name, config in configs.items()}
+    check_equal(settings, "one task and one robot")
+
+
+def check_equal(settings: Mapping[str, JsonObject], what: str) -> None:
+    """Raise an error if runs differ in settings.
+
+    Args:
+      settings: those of each run, by the name that the user gave.
+      what: what the settings are of.
+
+    Raises:
+      UserError: they differ.
+    """
+    (first, wanted), *others = settings.items()
     for name, found in others:
         for key in {**wanted, **found}:
             if wanted.get(key) != found.get(key):
                 raise UserError(
-                    f"{name} cannot be compared with {first}: {key} = {found.get(key)!r}, and not"
-                    f" {wanted.get(key)!r}; compare runs of one task and one robot"
+                    f"{name} cannot be compared with {first}: {key} = {shown(found.get(key))}, and"
+                    f" not {shown(wanted.get(key))}; compare runs of {what}"
                 )
 
 
@@ -181,20 +244,10 @@ def compare(folder: Path, runs: Mapping[str, Mapping[str, Report]]) -> Compariso
       UserError: their tasks sampled different goals from the same keys.
     """
     _check_goals(runs)
-    rows = tuple(_run(name, seeds) for name, seeds in runs.items())
-    first = next(iter(rows[0].seeds.values()))
-    return Comparison(
-        folder=folder,
-        episodes=first.policy.episodes,
-        settings={"robot": first.config.robot.label, **_task_settings(first.config)},
-        runs=rows,
-        pairs=tuple(_pair(a, b) for a, b in itertools.combinations(rows, 2)),
-        differences=differing_settings(
-            [next(iter(seeds.values())).config for seeds in runs.values()]
-        ),
-        baselines=first.baselines,
-        versions=first.versions,
-    )
+    rows = [_run(name, seeds) for name, seeds in runs.items()]
+    config = next(iter(rows[0].seeds.values())).config
+    settings = {"robot": config.robot.label, **_task_settings(config)}
+    return Comparison(**common_fields(folder, rows, _pair), settings=settings)
 
 
 def _check_goals(runs: Mapping[str, Mapping[str, Report]]) -> None:
@@ -217,7 +270,7 @@ def _run(name: str, seeds: Mapping[str, Report]) -> Run:
     else:
         success = aggregate_seeds([one.policy.success_rate for one in reports])
         time = aggregate_seeds(_times(reports))
-    return Run(name, seeds, success, time, _band([one.learning_curve for one in reports]))
+    return Run(name, seeds, success, time, band([one.learning_curve for one in reports]))
 
 
 def _times(reports: Sequence[Report]) -> list[float]:
@@ -249,23 +302,6 @@ def aggregate_seeds(values: Sequence[float]) -> Aggregate:
         len(values),
         bootstrap(np.mean, values),
         bootstrap(intervals.interquartile_mean, values),
-    )
-
-
-def _band(curves: Sequence[Sequence[CurvePoint]]) -> tuple[CurvePoint, ...]:
-    """Return the learning curve over seeds, at the steps that the curves of all seeds share."""
-    if len(curves) == 1:
-        return tuple(curves[0])
-    by_steps = [{point.env_steps: point.success_rate for point in curve} for curve in curves]
-    common = sorted(set.intersection(*(set(curve) for curve in by_steps)))
-    if not common:
-        return ()
-    rates = np.array([[curve[step] for step in common] for curve in by_steps])
-    lows, highs = intervals.bootstrap_interval(np.mean, [rates], axis=0)
-    columns = (common, rates.mean(axis=0), lows, highs)
-    return tuple(
-        CurvePoint(int(step), float(mean), float(low), float(high), None)
-        for step, mean, low, high in zip(*columns, strict=True)
     )
 
 

@@ -1,15 +1,17 @@
 """Evaluate policies of an environment of one's own on fixed starts, and write their reports."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import jax
 
 from jetbot_mjx import runs
 from jetbot_mjx.envs import AdaptedEnv
+from jetbot_mjx.evaluation.curves import ReturnPoint, read_curve
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
-from jetbot_mjx.evaluation.html_report import write_return_comparison, write_return_report
+from jetbot_mjx.evaluation.html_report import write_comparison, write_return_report
 from jetbot_mjx.evaluation.result_names import name_with_count
 from jetbot_mjx.evaluation.return_report import (
     ReturnComparison,
@@ -17,13 +19,13 @@ from jetbot_mjx.evaluation.return_report import (
     check_one_environment,
     compare_code,
     compare_returns,
-    return_curve,
 )
 from jetbot_mjx.evaluation.returns import ReturnEvaluator, return_baselines, summarize_returns
 from jetbot_mjx.runs import Checkpoint, Setup, check_writable, read_task_code
 from jetbot_mjx.terminal import stage
 
 _FOLDER = "evaluations"
+_Report = TypeVar("_Report")
 
 
 def write_returns(
@@ -72,27 +74,56 @@ def compare_return_runs(
     check_one_environment({name: one.config for name, one in firsts.items()})
     name = name_with_count("comparison", episodes, REPORT_GOALS, "-episodes")
     folder = Path(output or folder / _FOLDER / name)
+    reporter = _Reporter(episodes)
+
+    def place_of(checkpoint: Checkpoint) -> Path:
+        return _report_folder(checkpoint, episodes)
+
+    def write(checkpoint: Checkpoint, setup: Setup) -> ReturnReport:
+        return reporter.write(checkpoint, setup, place_of(checkpoint))
+
+    by_run = report_each(entries, folder, place_of, write)
+    code = compare_code({name: read_task_code(one.run_dir) for name, one in firsts.items()})
+    comparison = compare_returns(folder.absolute(), by_run, code)
+    with stage("writing the comparison"):
+        write_comparison(comparison)
+    return comparison
+
+
+def report_each(
+    entries: Mapping[str, Mapping[str, Checkpoint]],
+    folder: Path,
+    place_of: Callable[[Checkpoint], Path],
+    write: Callable[[Checkpoint, Setup], _Report],
+) -> dict[str, dict[str, _Report]]:
+    """Evaluate the policies of several runs or seeds, and write a report on each.
+
+    Args:
+      entries: the policy of each seed by name, of each run by name.
+      folder: the folder of the comparison.
+      place_of: a function that returns the folder in which a policy's report will be.
+      write: a function that evaluates a policy and writes its report.
+
+    Returns:
+      The report of each seed by name, of each run by name.
+
+    Raises:
+      UserError: an environment cannot be built, or a folder cannot be written.
+    """
     # Build all environments first, so that an unsuitable policy is rejected before any writing.
     policies = [
         (name, seed, checkpoint, checkpoint.make_setup())
         for name, seeds in entries.items()
         for seed, checkpoint in seeds.items()
     ]
-    places = [_report_folder(checkpoint, episodes) for _, _, checkpoint, _ in policies]
-    for path in (folder, *places):
+    for path in (folder, *(place_of(checkpoint) for _, _, checkpoint, _ in policies)):
         check_writable(path)
-    # Evaluate each policy and write its report.
-    by_run: dict[str, dict[str, ReturnReport]] = {name: {} for name in entries}
-    reporter = _Reporter(episodes)
+    by_run: dict[str, dict[str, _Report]] = {name: {} for name in entries}
     with stage("policies", len(policies)) as advance:
-        for (name, seed, checkpoint, setup), place in zip(policies, places, strict=True):
-            by_run[name][seed] = reporter.write(checkpoint, setup, place)
+        for name, seed, checkpoint, setup in policies:
+            by_run[name][seed] = write(checkpoint, setup)
             advance(1)
-    code = compare_code({name: read_task_code(one.run_dir) for name, one in firsts.items()})
-    comparison = compare_returns(folder.absolute(), by_run, code)
-    with stage("writing the comparison"):
-        write_return_comparison(comparison)
-    return comparison
+    return by_run
 
 
 def _report_folder(checkpoint: Checkpoint, episodes: int) -> Path:
@@ -158,7 +189,7 @@ class _Reporter:
             dt=env.dt,
             policy=summarize_returns(finished, has_success=env.has_success),
             baselines=self._baselines,
-            learning_curve=return_curve((one.env_steps, one.metrics) for one in history),
+            learning_curve=read_curve(ReturnPoint, history),
             episodes=finished,
             versions=self._versions,
             fallbacks=checkpoint.about.get("fallbacks", ()),

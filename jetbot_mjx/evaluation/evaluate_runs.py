@@ -12,7 +12,8 @@ from jetbot_mjx.envs import OTHER_NUMERICS, DomainRandomizationWrapper, JetBotEn
 from jetbot_mjx.errors import InvalidError, UserError
 from jetbot_mjx.evaluation.clips import ClipMaker, clip_goals
 from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compare
-from jetbot_mjx.evaluation.evaluate_returns import compare_return_runs, write_returns
+from jetbot_mjx.evaluation.curves import CurvePoint, LossPoint, read_curve
+from jetbot_mjx.evaluation.evaluate_returns import compare_return_runs, report_each, write_returns
 from jetbot_mjx.evaluation.evaluator import BASELINES, Evaluator, report_keys, summarize
 from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
 from jetbot_mjx.evaluation.html_report import write_comparison, write_report
@@ -22,8 +23,6 @@ from jetbot_mjx.evaluation.report import (
     by_goal,
     compare_times,
     find_failures,
-    learning_curve,
-    losses,
 )
 from jetbot_mjx.evaluation.result_names import find_report, name_with_count, report_folder
 from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
@@ -155,31 +154,21 @@ def compare_runs(
     # Load all policies and check that they can be compared.
     entries = _load_runs([Path(path) for path in runs], reporter.which)
     first = next(iter(entries.values())).folder
+    seeds = {name: one.seeds for name, one in entries.items()}
     for entry in entries.values():
         if (config := entry.first.config).environment is not None:
             _check_returns(config, options)
-            seeds = {name: one.seeds for name, one in entries.items()}
             return compare_return_runs(seeds, first, reporter.episodes, reporter.output)
     check_comparable({name: entry.first.config for name, entry in entries.items()})
     name = name_with_count("comparison", reporter.episodes, REPORT_GOALS, "-goals")
     folder = Path(reporter.output or first / _FOLDER / name)
-    # Build all environments first, so that an unsuitable policy is rejected before any writing.
-    policies = [
-        (name, seed, checkpoint, checkpoint.make_setup())
-        for name, entry in entries.items()
-        for seed, checkpoint in entry.seeds.items()
-    ]
-    for path in (folder, *(checkpoint.results_dir / _FOLDER for _, _, checkpoint, _ in policies)):
-        check_writable(path)
-    # Evaluate each policy and write its report.
-    by_run: dict[str, dict[str, Report]] = {name: {} for name in entries}
-    with stage("policies", len(policies)) as advance:
-        for name, seed, checkpoint, setup in policies:
-            report = reporter.write(checkpoint, setup, again=False)
-            # Drop the trajectories, which are large and already plotted.
-            by_run[name][seed] = report._replace(episodes=report.episodes._replace(qpos=None))
-            advance(1)
-    # Compare the reports and write the comparison.
+
+    def write(checkpoint: Checkpoint, setup: Setup) -> Report:
+        report = reporter.write(checkpoint, setup, again=False)
+        # Drop the trajectories, which are large and already plotted.
+        return report._replace(episodes=report.episodes._replace(qpos=None))
+
+    by_run = report_each(seeds, folder, lambda checkpoint: checkpoint.results_dir / _FOLDER, write)
     comparison = compare(folder.absolute(), by_run)
     with stage("writing the comparison"):
         write_comparison(comparison)
@@ -367,8 +356,8 @@ class _Reporter:
             baselines=self._baselines,
             goal_bins=by_goal(finished, env.dt),
             failures=find_failures(finished, run_dir, checkpoint.env_steps),
-            learning_curve=learning_curve((one.env_steps, one.metrics) for one in history),
-            losses=losses((one.env_steps, one.metrics) for one in history),
+            learning_curve=read_curve(CurvePoint, history),
+            losses=read_curve(LossPoint, history),
             episodes=finished,
             versions=self._versions,
             fallbacks=checkpoint.about.get("fallbacks", ()),

@@ -98,7 +98,7 @@ def write_report(report: Report) -> Path:
     )
 
 
-def write_comparison(comparison: Comparison) -> Path:
+def write_comparison(comparison: Comparison | ReturnComparison) -> Path:
     """Write a comparison into its folder.
 
     Args:
@@ -114,8 +114,13 @@ def write_comparison(comparison: Comparison) -> Path:
     figures = {"runs": lambda: learning_curves.plot_runs(comparison)}
     if any(run.learning_curve for run in comparison.runs):
         figures["learning_curves"] = lambda: learning_curves.plot_learning_curves(comparison)
-    more = {"links": _links(comparison)}
-    return _write(comparison.folder, "comparison", comparison.to_json(), figures, more)
+    links = [
+        [os.path.relpath(one.folder / "report", comparison.folder) for one in run.seeds.values()]
+        for run in comparison.runs
+    ]
+    template = "comparison" if isinstance(comparison, Comparison) else "return_comparison"
+    values = comparison.to_json()
+    return _write(comparison.folder, "comparison", values, figures, {"links": links}, template)
 
 
 def write_return_report(report: ReturnReport) -> Path:
@@ -135,34 +140,6 @@ def write_return_report(report: ReturnReport) -> Path:
         figures["learning_curve"] = lambda: return_plots.plot_return_curve(report)
     more = {"evaluate_command": report.evaluate_command()}
     return _write(report.folder, "report", report.to_json(), figures, more, "return_report")
-
-
-def write_return_comparison(comparison: ReturnComparison) -> Path:
-    """Write a comparison of runs in one environment of one's own, as `write_comparison` does.
-
-    Args:
-      comparison: a comparison of runs whose own reports are already written.
-
-    Returns:
-      The path of `comparison.html`.
-
-    Raises:
-      UserError: the folder cannot be written.
-    """
-    figures = {"runs": lambda: return_plots.plot_return_runs(comparison)}
-    if any(run.learning_curve for run in comparison.runs):
-        figures["learning_curves"] = lambda: return_plots.plot_return_curves(comparison)
-    more = {"links": _links(comparison)}
-    values = comparison.to_json()
-    return _write(comparison.folder, "comparison", values, figures, more, "return_comparison")
-
-
-def _links(comparison: Comparison | ReturnComparison) -> list[list[str]]:
-    """Return the reports of each run's seeds, without the ends of their files' names."""
-    return [
-        [os.path.relpath(one.folder / "report", comparison.folder) for one in run.seeds.values()]
-        for run in comparison.runs
-    ]
 
 
 def _write(

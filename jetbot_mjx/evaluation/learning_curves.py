@@ -8,8 +8,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from jetbot_mjx.evaluation.comparison import Aggregate, Comparison
-from jetbot_mjx.evaluation.plots import plot_rates
-from jetbot_mjx.evaluation.report import CurvePoint, Report
+from jetbot_mjx.evaluation.curves import CurvePoint, ReturnPoint
+from jetbot_mjx.evaluation.plots import plot_band
+from jetbot_mjx.evaluation.report import Report
+from jetbot_mjx.evaluation.return_report import ReturnComparison
+
+SUCCESS, RETURN = "success rate", "mean return"
+_QUANTITIES = {
+    "episode_return": ("episode_return", RETURN),
+    "success_rate": ("success_rate", SUCCESS),
+    "time_to_goal": ("time_to_goal_median", "median time to goal [s]"),
+}
+"""Quantities of a run, each with its name in the results of a seed, and its label."""
 
 
 def plot_learning_curve(report: Report) -> Figure:
@@ -23,15 +33,13 @@ def plot_learning_curve(report: Report) -> Figure:
     """
     figure = Figure(figsize=(10.4, 3.6), layout="constrained")
     axes = figure.add_subplot()
-    steps = [point.env_steps for point in report.learning_curve]
-    label = "during the training, its own goals"
-    plot_rates(axes, steps, report.learning_curve, color="C0", label=label)
+    plot_curve(axes, report.learning_curve, "C0", "during the training, its own goals")
     policy, x = report.policy, report.env_steps
     interval, label = [policy.success_low, policy.success_high], "this report, the report's goals"
     axes.axvline(x, color=matplotlib.rcParams["grid.color"], lw=1, zorder=0)
     axes.plot(x, policy.success_rate, "D", color="C1", markersize=5, label=label, zorder=3)
     axes.plot([x, x], interval, color="C1", marker="_", markersize=8, zorder=3)
-    _label_curves(axes)
+    label_curves(axes, SUCCESS)
     return figure
 
 
@@ -57,8 +65,8 @@ def plot_losses(report: Report) -> Figure:
     return figure
 
 
-def plot_learning_curves(comparison: Comparison) -> Figure:
-    """Plot the success rate over the training of every run, with a band.
+def plot_learning_curves(comparison: Comparison | ReturnComparison) -> Figure:
+    """Plot the success rate or the mean return over the training of every run, with a band.
 
     Args:
       comparison: a comparison of runs, some of which have a learning curve.
@@ -69,69 +77,80 @@ def plot_learning_curves(comparison: Comparison) -> Figure:
     figure = Figure(figsize=(10.4, 4.0), layout="constrained")
     axes = figure.add_subplot()
     # Draw the curve once for two checkpoints of the same run.
-    named: dict[tuple[CurvePoint, ...], list[str]] = {}
+    named: dict[tuple[CurvePoint | ReturnPoint, ...], list[str]] = {}
     for run in comparison.runs:
         seeds = f", {len(run.seeds)} seeds" if len(run.seeds) > 1 else ""
         named.setdefault(run.learning_curve, []).append(run.name + seeds)
-    colours = {run.learning_curve: f"C{index}" for index, run in enumerate(comparison.runs)}
+    curves = [run.learning_curve for run in comparison.runs]
     for points, names in named.items():
         if points:
-            steps = [point.env_steps for point in points]
-            plot_rates(axes, steps, points, color=colours[points], label="; ".join(names))
-    _label_curves(axes)
+            last = max(index for index, curve in enumerate(curves) if curve == points)
+            plot_curve(axes, points, f"C{last}", "; ".join(names))
+    label_curves(axes, SUCCESS if isinstance(comparison, Comparison) else RETURN)
     return figure
 
 
-def _label_curves(axes: Axes) -> None:
-    axes.set(xlabel="environment steps", ylabel="success rate", ylim=(-0.02, 1.04))
-    axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+def plot_curve(
+    axes: Axes, points: Sequence[CurvePoint | ReturnPoint], color: str, label: str
+) -> None:
+    """Draw a learning curve with its intervals as a band.
+
+    Args:
+      axes: the axes to draw on.
+      points: the curve.
+      color: the colour of line and band.
+      label: what the legend says.
+    """
+    steps, values = [point.env_steps for point in points], [point[1:4] for point in points]
+    plot_band(axes, steps, values, color=color, label=label)
+
+
+def label_curves(axes: Axes, quantity: str) -> None:
+    """Label the axes of learning curves of a quantity, `SUCCESS` or `RETURN`."""
+    axes.set(xlabel="environment steps", ylabel=quantity)
+    if quantity == SUCCESS:
+        axes.set(ylim=(-0.02, 1.04))
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     axes.xaxis.set_major_formatter(EngFormatter())
     axes.grid()
     axes.set_axisbelow(True)
     axes.legend(loc="best", fontsize="small")
 
 
-def plot_runs(comparison: Comparison) -> Figure:
-    """Plot the success rate and time to the goal of every run, with intervals and every seed.
+def plot_runs(comparison: Comparison | ReturnComparison) -> Figure:
+    """Plot the results of every run, with intervals and every seed.
 
     Args:
       comparison: a comparison of runs.
 
     Returns:
-      The figure.
+      The figure, with a panel for each quantity that a run has.
     """
-    height = 1.0 + 0.45 * len(comparison.runs)
-    figure = Figure(figsize=(10.4, height), layout="constrained")
-    success, seconds = figure.subplots(1, 2, sharey=True)
-    for row, run in enumerate(comparison.runs):
-        policies = [report.policy for report in run.seeds.values()]
-        plot_aggregate(success, row, run.success_rate, [one.success_rate for one in policies])
-        plot_aggregate(
-            seconds, row, run.time_to_goal, [one.time_to_goal_median for one in policies]
-        )
-    success.set_yticks(range(len(comparison.runs)), [run.name for run in comparison.runs])
-    success.set_ylim(len(comparison.runs) - 0.5, -0.6)
-    success.xaxis.set_major_formatter(PercentFormatter(1.0))
-    success.set(xlabel="success rate")
-    seconds.set(xlabel="median time to goal [s]")
-    for axes in (success, seconds):
+    runs = comparison.runs
+    names = [name for name in _QUANTITIES if any(getattr(run, name, None) for run in runs)]
+    figure = Figure(figsize=(10.4, 1.0 + 0.45 * len(runs)), layout="constrained")
+    grid = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    for axes, name in zip(grid, names, strict=True):
+        of_seed, label = _QUANTITIES[name]
+        for row, run in enumerate(runs):
+            if aggregate := getattr(run, name):
+                values = [getattr(report.policy, of_seed) for report in run.seeds.values()]
+                _plot_aggregate(axes, row, aggregate, values)
+        axes.set(xlabel=label)
+        if label == SUCCESS:
+            axes.xaxis.set_major_formatter(PercentFormatter(1.0))
         axes.grid(axis="x")
         axes.set_axisbelow(True)
         axes.tick_params(axis="y", length=0)
+    grid[0].set_yticks(range(len(runs)), [run.name for run in runs])
+    grid[0].set_ylim(len(runs) - 0.5, -0.6)
     return figure
 
 
-def plot_aggregate(
+def _plot_aggregate(
     axes: Axes, row: int, aggregate: Aggregate, values: Sequence[float | None]
 ) -> None:
-    """Draw a run's seeds, its mean with interval, and below it the interquartile mean.
-
-    Args:
-      axes: the axes to draw on.
-      row: the number of the run, from above.
-      aggregate: the quantity over its seeds or episodes.
-      values: the quantity of each seed.
-    """
+    """Draw a run's seeds, its mean with interval, and below it the interquartile mean."""
     colour = f"C{row}"
     kinds = [(aggregate.mean, 0.0, "o"), (aggregate.iqm, 0.22, "s")]
     if aggregate.over == "seeds":

@@ -21,8 +21,8 @@ from matplotlib.projections.polar import PolarAxes
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 from matplotlib.typing import ColorType
 
-from jetbot_mjx.evaluation.evaluator import Summary, final_distances, path_efficiencies
-from jetbot_mjx.evaluation.report import SECTORS, CurvePoint, GoalBin, Report
+from jetbot_mjx.evaluation.evaluator import final_distances, path_efficiencies
+from jetbot_mjx.evaluation.report import SECTORS, GoalBin, Report
 from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, SweepResult
 from jetbot_mjx.evaluation.rollout import Episodes
 
@@ -262,7 +262,8 @@ def plot_robustness(results: Sequence[SweepResult]) -> Figure:
             ("policy", result.policy, "C0"),
         ):
             values = result.sweep.values
-            plot_rates(success, values, summaries, color=colour, label=name)
+            rates = [(one.success_rate, one.success_low, one.success_high) for one in summaries]
+            plot_band(success, values, rates, color=colour, label=name)
             seconds = [summary.time_to_goal_median for summary in summaries]
             time.plot(values, np.array(seconds, float), marker="o", markersize=4, color=colour)
         for axes in (success, time):
@@ -281,25 +282,23 @@ def plot_robustness(results: Sequence[SweepResult]) -> Figure:
     return figure
 
 
-def plot_rates(
+def plot_band(
     axes: Axes,
     x: Sequence[float],
-    points: Sequence[Summary] | Sequence[CurvePoint],
+    values: Sequence[tuple[float, float, float]],
     *,
     color: str,
     label: str,
 ) -> None:
-    """Plot success rates over x, with their intervals as a band.
+    """Draw a quantity over something, with its intervals as a band.
 
     Args:
       axes: the axes to draw on.
-      x: the place of each point.
-      points: objects with a success rate and the ends of its interval.
+      x: the horizontal position of each value.
+      values: the quantity, and the lower and the upper end of its interval.
       color: the colour of line and band.
-      label: the label of the line.
+      label: what the legend says.
     """
-    low = [point.success_low for point in points]
-    high = [point.success_high for point in points]
+    middle, low, high = zip(*values, strict=True)
     axes.fill_between(x, low, high, color=color, alpha=0.25, lw=0)
-    rates = [point.success_rate for point in points]
-    axes.plot(x, rates, color=color, marker="o", markersize=4, label=label)
+    axes.plot(x, middle, color=color, marker="o", markersize=4, label=label)

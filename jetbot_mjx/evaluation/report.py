@@ -6,7 +6,7 @@ left.
 
 import math
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,12 +16,14 @@ from jaxtyping import Float, Int
 from jetbot_mjx.config import Config, RandomizationConfig
 from jetbot_mjx.evaluation import best_known
 from jetbot_mjx.evaluation.clips import Clip
+from jetbot_mjx.evaluation.curves import CurvePoint, LossPoint
 from jetbot_mjx.evaluation.evaluator import Summary, final_distances, json_values, success_and_time
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
 from jetbot_mjx.evaluation.moments import SeenEpisode, moments_as_json
+from jetbot_mjx.evaluation.result_names import run_name
 from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
 from jetbot_mjx.evaluation.rollout import Episodes
-from jetbot_mjx.runs import JsonObject, MetricValues, RunChanges, shortened
+from jetbot_mjx.runs import JsonObject, RunChanges, shortened
 
 TIME_LIMIT = "time limit"
 ENDED_BY_TASK = "ended by the task"
@@ -80,27 +82,6 @@ class Failure(NamedTuple):
     replay: str | None
     """The command that renders the episode; None if the goal is beyond those that can be rendered.
     """
-
-
-class CurvePoint(NamedTuple):
-    """A `CurvePoint` holds one evaluation during the training, on goals common to all of them."""
-
-    env_steps: int
-    success_rate: float
-    success_low: float
-    success_high: float
-    time_to_goal_median: float | None
-    """[s] Median over the successes; None without a success, and in a curve over several seeds."""
-
-
-class LossPoint(NamedTuple):
-    """A `LossPoint` holds the losses of one line of the training's metrics."""
-
-    env_steps: int
-    policy: float
-    value: float
-    kl: float
-    """Kullback-Leibler divergence of the policy from the one that collected the data."""
 
 
 class TimeGap(NamedTuple):
@@ -191,9 +172,7 @@ class Report(NamedTuple):
     @property
     def name(self) -> str:
         """Return the readable name of the run; for a seed, with the folder that holds all seeds."""
-        run_dir = self.checkpoint.parents[1]
-        alone = not run_dir.name.startswith("seed-")
-        return run_dir.name if alone else f"{run_dir.parent.name}/{run_dir.name}"
+        return run_name(self.checkpoint)
 
     def evaluate_command(self) -> str:
         """Return the command line that creates this report."""
@@ -370,31 +349,3 @@ def replay_command(run: Path, env_steps: int, goals: Sequence[int]) -> str | Non
     if not which:
         return None
     return f"jetbot-mjx render {shlex.quote(str(run))} --checkpoint {env_steps} --goals {which}"
-
-
-def learning_curve(history: Iterable[tuple[int, MetricValues]]) -> tuple[CurvePoint, ...]:
-    """Extract the evaluations from the metrics of a training.
-
-    Args:
-      history: environment steps and metrics, as in `metrics.jsonl`.
-
-    Returns:
-      One point for each line that holds a success rate with its interval.
-    """
-    points = []
-    for env_steps, metrics in history:
-        rate, low, high, seconds = (metrics.get(f"eval/{name}") for name in CurvePoint._fields[1:])
-        if rate is not None and low is not None and high is not None:
-            points.append(CurvePoint(env_steps, rate, low, high, seconds))
-    return tuple(sorted(points, key=lambda point: point.env_steps))
-
-
-def losses(history: Iterable[tuple[int, MetricValues]]) -> tuple[LossPoint, ...]:
-    """Extract the losses from the metrics of a training, as `learning_curve` does."""
-    points = []
-    for env_steps, metrics in history:
-        names = ("loss/policy", "loss/value", "policy/kl")
-        policy, value, kl = (metrics.get(name) for name in names)
-        if policy is not None and value is not None and kl is not None:
-            points.append(LossPoint(env_steps, policy, value, kl))
-    return tuple(points)

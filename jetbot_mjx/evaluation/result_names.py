@@ -23,6 +23,17 @@ def name_with_count(name: str, count: int, default: int, unit: str = "") -> str:
     return name if count == default else f"{name}-{count}{unit}"
 
 
+def run_name(checkpoint: Path) -> str:
+    """Return the readable name of a run; for a seed, with the folder that holds all seeds.
+
+    Args:
+      checkpoint: the folder of a checkpoint of the run.
+    """
+    run_dir = checkpoint.parents[1]
+    alone = not run_dir.name.startswith("seed-")
+    return run_dir.name if alone else f"{run_dir.parent.name}/{run_dir.name}"
+
+
 def report_folder(evaluations: Path, name: str, goals: int, parts: frozenset[str]) -> Path:
     """Choose the folder of a new report, in which no fuller report lies.
 

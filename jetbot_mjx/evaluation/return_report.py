@@ -4,29 +4,31 @@ A report on one policy and a comparison of several are named tuples, each with i
 of a comparison are over seeds or over episodes, as `comparison` explains.
 """
 
-import itertools
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.errors import UserError, shown
-from jetbot_mjx.evaluation.bootstrap_intervals import Estimate, bootstrap
+from jetbot_mjx.evaluation.bootstrap_intervals import Estimate
 from jetbot_mjx.evaluation.comparison import (
     Aggregate,
     PairwiseResult,
     aggregate_seeds,
+    check_equal,
+    common_fields,
     compare_pairwise,
-    differing_settings,
+    comparison_json,
 )
+from jetbot_mjx.evaluation.curves import ReturnPoint, band
 from jetbot_mjx.evaluation.evaluator import json_values
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
+from jetbot_mjx.evaluation.result_names import run_name
 from jetbot_mjx.evaluation.returns import ReturnSummary
 from jetbot_mjx.evaluation.rollout import ReturnEpisodes
-from jetbot_mjx.runs import JsonObject, MetricValues, TaskCode, shortened
+from jetbot_mjx.runs import JsonObject, TaskCode, shortened
 
 _SETTINGS = (
     "environment",
@@ -40,20 +42,6 @@ _SETTINGS = (
     "ppo.network.policy_hidden_layer_sizes",
 )
 """Settings of the configuration that a report shows, besides the environment's options."""
-
-_SHARED = ("environment", "environment_options", "task.episode_length")
-"""Settings that compared runs must share, because returns depend on them."""
-
-
-class ReturnPoint(NamedTuple):
-    """A `ReturnPoint` holds one evaluation during the training, on starts common to all of them."""
-
-    env_steps: int
-    episode_return: float
-    return_low: float
-    """Lower end of the 95 % interval of the mean."""
-    return_high: float
-    """Upper end of the interval."""
 
 
 class ReturnReport(NamedTuple):
@@ -88,9 +76,7 @@ class ReturnReport(NamedTuple):
     @property
     def name(self) -> str:
         """Return the readable name of the run; for a seed, with the folder that holds all seeds."""
-        run_dir = self.checkpoint.parents[1]
-        alone = not run_dir.name.startswith("seed-")
-        return run_dir.name if alone else f"{run_dir.parent.name}/{run_dir.name}"
+        return run_name(self.checkpoint)
 
     def evaluate_command(self) -> str:
         """Return the command line that creates this report."""
@@ -167,39 +153,7 @@ class ReturnComparison(NamedTuple):
 
     def to_json(self) -> JsonObject:
         """Return everything except the episodes as JSON values."""
-        values = {name: value for name, value in self._asdict().items() if name != "folder"}
-        values["runs"] = [_run_json(run) for run in self.runs]
-        return json_values({"goal_set_version": GOAL_SET_VERSION, **values})
-
-
-def _run_json(run: ReturnRun) -> JsonObject:
-    seeds = [
-        {
-            "name": name,
-            "checkpoint": report.checkpoint.name,
-            "env_steps": report.env_steps,
-            "policy": report.policy,
-        }
-        for name, report in run.seeds.items()
-    ]
-    return {**run._asdict(), "seeds": seeds}
-
-
-def return_curve(history: Iterable[tuple[int, MetricValues]]) -> tuple[ReturnPoint, ...]:
-    """Extract the evaluations from the metrics of a training.
-
-    Args:
-      history: environment steps and metrics, as in `metrics.jsonl`.
-
-    Returns:
-      One point for each line that holds a mean return with its interval.
-    """
-    points = []
-    for env_steps, metrics in history:
-        mean, low, high = (metrics.get(f"eval/{name}") for name in ReturnPoint._fields[1:])
-        if mean is not None and low is not None and high is not None:
-            points.append(ReturnPoint(env_steps, mean, low, high))
-    return tuple(sorted(points, key=lambda point: point.env_steps))
+        return comparison_json(self._asdict(), "policy")
 
 
 def check_one_environment(configs: Mapping[str, Config]) -> None:
@@ -211,22 +165,15 @@ def check_one_environment(configs: Mapping[str, Config]) -> None:
     Raises:
       UserError: the runs differ in the environment, its options or the length of an episode.
     """
-    (first, wanted), *others = ((name, _shared(config)) for name, config in configs.items())
-    for name, found in others:
-        for key in _SHARED:
-            if found[key] != wanted[key]:
-                raise UserError(
-                    f"{name} cannot be compared with {first}: {key} = {shown(found[key])}, and not"
-                    f" {shown(wanted[key])}; compare runs of one environment"
-                )
-
-
-def _shared(config: Config) -> JsonObject:
-    return {
-        "environment": config.environment,
-        "environment_options": config.environment_options,
-        "task.episode_length": config.task.episode_length,
+    settings = {
+        name: {
+            "environment": config.environment,
+            "environment_options": config.environment_options,
+            "task.episode_length": config.task.episode_length,
+        }
+        for name, config in configs.items()
     }
+    check_equal(settings, "one environment")
 
 
 def compare_code(codes: Mapping[str, TaskCode | None]) -> tuple[str, ...]:
@@ -270,20 +217,10 @@ def compare_returns(
       runs: for each run by name, the report of each seed by name; all on the same starts.
       other_code: a result of `compare_code`.
     """
-    rows = tuple(_run(name, seeds) for name, seeds in runs.items())
-    first = next(iter(rows[0].seeds.values()))
+    rows = [_run(name, seeds) for name, seeds in runs.items()]
+    environment = next(iter(rows[0].seeds.values())).config.code
     return ReturnComparison(
-        folder=folder,
-        episodes=first.policy.episodes,
-        environment=first.config.code,
-        runs=rows,
-        pairs=tuple(_pair(a, b) for a, b in itertools.combinations(rows, 2)),
-        differences=differing_settings(
-            [next(iter(seeds.values())).config for seeds in runs.values()]
-        ),
-        other_code=other_code,
-        baselines=first.baselines,
-        versions=first.versions,
+        **common_fields(folder, rows, _pair), environment=environment, other_code=other_code
     )
 
 
@@ -291,7 +228,7 @@ def _run(name: str, seeds: Mapping[str, ReturnReport]) -> ReturnRun:
     reports = list(seeds.values())
     policies = [one.policy for one in reports]
     rates = [one.success_rate for one in policies if one.success_rate is not None]
-    curve = _band([one.learning_curve for one in reports])
+    curve = band([one.learning_curve for one in reports])
     if len(reports) > 1:
         success = aggregate_seeds(rates) if rates else None
         returns = aggregate_seeds([one.episode_return for one in policies])
@@ -306,21 +243,6 @@ def _run(name: str, seeds: Mapping[str, ReturnReport]) -> ReturnRun:
         Aggregate("episodes", one.episodes, rate, Estimate(None)) if rates else None,
         curve,
     )
-
-
-def _band(curves: Sequence[Sequence[ReturnPoint]]) -> tuple[ReturnPoint, ...]:
-    """Return the learning curve over seeds, at the steps that the curves of all seeds share."""
-    if len(curves) == 1:
-        return tuple(curves[0])
-    by_steps = [{point.env_steps: point.episode_return for point in curve} for curve in curves]
-    common = sorted(set.intersection(*(set(curve) for curve in by_steps)))
-    points = []
-    for step in common:
-        mean = bootstrap(np.mean, [curve[step] for curve in by_steps])
-        assert mean.value is not None
-        low, high = (mean.value if end is None else end for end in mean[1:])
-        points.append(ReturnPoint(step, mean.value, low, high))
-    return tuple(points)
 
 
 def _pair(a: ReturnRun, b: ReturnRun) -> ReturnPair:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-from jetbot_mjx.evaluation.bootstrap_intervals import Estimate
 from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
 from jetbot_mjx.evaluation.returns import ReturnSummary
 from jetbot_mjx.terminal import text_table
@@ -32,22 +31,19 @@ def summarize_return_comparison(comparison: ReturnComparison) -> str:
     rows = [("", "return, mean", "interquartile mean", "success, mean", "95 % intervals over")]
     for run in runs:
         found = run.episode_return
-        success = _estimate(run.success_rate.mean, "{:.2%}") if run.success_rate else "-"
+        success = run.success_rate.mean.told("{:.2%}") if run.success_rate else "-"
         over = f"{found.count:,} {found.over}"
-        both = _estimate(found.mean, "{:.2f}"), _estimate(found.iqm, "{:.2f}")
+        both = found.mean.told("{:.2f}"), found.iqm.told("{:.2f}")
         rows.append((run.name, *both, success, over))
     lines = [
         f"{comparison.episodes:,} fixed starts, {len(policies)} policies",
         _policies_table({**policies, **comparison.baselines}),
         f"\n{text_table(rows)}\n",
     ]
-    for pair in comparison.pairs:
-        result = pair.episode_return
-        lines.append(
-            f"{pair.a} against {pair.b}: difference {_estimate(result.difference, '{:+.2f}')},"
-            f" improvement {_estimate(result.improvement, '{:.0%}')},"
-            f" starts {result.wins} : {result.losses} (p {result.p:.2g})"
-        )
+    lines += [
+        f"{pair.a} against {pair.b}: {pair.episode_return.told('{:+.2f}', 'starts')}"
+        for pair in comparison.pairs
+    ]
     lines += comparison.other_code
     return "\n".join([*lines, f"report: {comparison.folder / 'comparison.html'}"])
 
@@ -66,12 +62,3 @@ def _policies_table(policies: Mapping[str, ReturnSummary]) -> str:
         for name, one in policies.items()
     ]
     return text_table(rows)
-
-
-def _estimate(estimate: Estimate, form: str) -> str:
-    if estimate.value is None:
-        return "-"
-    text = form.format(estimate.value)
-    if estimate.low is None or estimate.high is None:
-        return text
-    return f"{text} ({form.format(estimate.low)} .. {form.format(estimate.high)})"

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation.bootstrap_intervals import Estimate
 from jetbot_mjx.evaluation.comparison import Comparison
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
@@ -179,9 +178,9 @@ def runs_table(comparison: Comparison) -> str:
     rows += [
         (
             run.name,
-            _estimate(run.success_rate.mean, "{:.2%}"),
-            _estimate(run.success_rate.iqm, "{:.2%}"),
-            _estimate(run.time_to_goal.mean, "{:.2f} s"),
+            run.success_rate.mean.told("{:.2%}"),
+            run.success_rate.iqm.told("{:.2%}"),
+            run.time_to_goal.mean.told("{:.2f} s"),
             f"{run.success_rate.count:,} {run.success_rate.over}",
         )
         for run in comparison.runs
@@ -198,12 +197,7 @@ def pairs_table(comparison: Comparison) -> str:
             ("success", pair.success_rate, "{:+.2%}"),
             ("time", pair.time_to_goal, "{:+.3f} s"),
         )
-        for name, result, form in quantities:
-            lines.append(
-                f"  {name:8}  difference {_estimate(result.difference, form)},"
-                f" improvement {_estimate(result.improvement, '{:.0%}')},"
-                f" goals {result.wins} : {result.losses} (p {result.p:.2g})"
-            )
+        lines += [f"  {name:8}  {result.told(form, 'goals')}" for name, result, form in quantities]
     return "\n".join(lines)
 
 
@@ -213,10 +207,3 @@ def _count(number: int, what: str) -> str:
 
 def _value(value: float | None, form: str) -> str:
     return form.format(value) if value is not None else "-"
-
-
-def _estimate(estimate: Estimate, form: str) -> str:
-    text = _value(estimate.value, form)
-    if estimate.low is None:
-        return text
-    return f"{text} ({_value(estimate.low, form)} .. {_value(estimate.high, form)})"

@@ -10,8 +10,8 @@ from helpers.reports import TEN_GOALS, comparison_of, make_episodes, make_report
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.comparison import check_comparable
+from jetbot_mjx.evaluation.curves import CurvePoint
 from jetbot_mjx.evaluation.evaluator import wilson_interval
-from jetbot_mjx.evaluation.report import CurvePoint
 from jetbot_mjx.evaluation.tables import pairs_table, policies_table, runs_table
 
 

@@ -11,8 +11,8 @@ from helpers import chromium
 from helpers.reports import make_episodes, make_report, polar
 from helpers.unpainted import unpainted
 from jetbot_mjx.evaluation.comparison import compare
+from jetbot_mjx.evaluation.curves import CurvePoint
 from jetbot_mjx.evaluation.html_report import write_comparison, write_report
-from jetbot_mjx.evaluation.report import CurvePoint
 from jetbot_mjx.evaluation.robustness import SWEEPS, SweepResult
 from jetbot_mjx.evaluation.tables import summarize_comparison, summarize_report
 

@@ -10,13 +10,14 @@ from PIL import Image
 from helpers.reports import CTRL_DT, comparison_of, make_episodes, make_report, polar, wins
 from helpers.reports import report_of as judged
 from jetbot_mjx.evaluation import plots
+from jetbot_mjx.evaluation.curves import CurvePoint
 from jetbot_mjx.evaluation.learning_curves import (
     plot_learning_curve,
     plot_learning_curves,
     plot_runs,
 )
 from jetbot_mjx.evaluation.moments import shown_goals
-from jetbot_mjx.evaluation.report import CurvePoint, by_goal
+from jetbot_mjx.evaluation.report import by_goal
 
 
 def texts(axes):

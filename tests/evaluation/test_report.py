@@ -15,11 +15,9 @@ from jetbot_mjx.evaluation.report import (
     NON_FINITE,
     SECTORS,
     TIME_LIMIT,
-    CurvePoint,
     by_goal,
     find_failures,
     goal_positions,
-    learning_curve,
 )
 
 
@@ -98,20 +96,6 @@ def test_goals_that_cannot_be_rendered_have_no_replay_command(monkeypatch):
     found = find_failures(make_episodes([[1, 0], [0, 1]], [0, 0]), Path("runs/a"), 2048)
     assert found[0].replay.endswith("--goals 0")
     assert found[1].replay is None
-
-
-def test_a_learning_curve_is_made_of_the_evaluations_alone():
-    judged = {f"eval/{name}": 0.5 for name in CurvePoint._fields[1:]}
-    history = [
-        (2048, {**judged, "eval/time_to_goal_median": None}),
-        (0, judged),
-        (4096, {"loss/total": 1.0}),
-        (6144, {**judged, "eval/success_rate": None}),
-    ]
-    assert learning_curve(history) == (
-        CurvePoint(0, 0.5, 0.5, 0.5, 0.5),
-        CurvePoint(2048, 0.5, 0.5, 0.5, None),
-    )
 
 
 def test_a_report_is_json_and_names_its_run():

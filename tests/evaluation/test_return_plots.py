@@ -5,13 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from helpers.reports import return_report_of
-from jetbot_mjx.evaluation.return_plots import (
-    plot_return_curve,
-    plot_return_curves,
-    plot_return_runs,
-    plot_returns,
-)
-from jetbot_mjx.evaluation.return_report import ReturnPoint, compare_returns
+from jetbot_mjx.evaluation.curves import ReturnPoint
+from jetbot_mjx.evaluation.learning_curves import plot_learning_curves, plot_runs
+from jetbot_mjx.evaluation.return_plots import plot_return_curve, plot_returns
+from jetbot_mjx.evaluation.return_report import compare_returns
 
 CURVE = ReturnPoint(0, 1.0, 0.5, 1.5), ReturnPoint(2048, 3.0, 2.0, 4.0)
 
@@ -40,13 +37,13 @@ def test_a_curve_shows_the_training_the_report_and_the_baselines():
 def test_a_comparison_draws_every_run_once():
     seeds = {f"seed-{i}": return_report_of([1.0 + i], curve=CURVE) for i in range(2)}
     comparison = compare_returns(Path("there"), {"a": seeds, "b": {"seed-0": seeds["seed-1"]}})
-    (axes,) = plot_return_curves(comparison).axes
+    (axes,) = plot_learning_curves(comparison).axes
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
     assert labels == ["a, 2 seeds", "b"]
-    (returns,) = plot_return_runs(comparison).axes
+    (returns,) = plot_runs(comparison).axes
     assert [text.get_text() for text in returns.get_yticklabels()] == ["a", "b"]
     success = comparison.runs[0].episode_return
     told = comparison._replace(
         runs=tuple(x._replace(success_rate=success) for x in comparison.runs)
     )
-    assert len(plot_return_runs(told).axes) == 2
+    assert len(plot_runs(told).axes) == 2

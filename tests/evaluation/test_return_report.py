@@ -7,12 +7,11 @@ import pytest
 
 from helpers.reports import return_report_of
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.curves import ReturnPoint
 from jetbot_mjx.evaluation.return_report import (
-    ReturnPoint,
     check_one_environment,
     compare_code,
     compare_returns,
-    return_curve,
 )
 from jetbot_mjx.runs import TaskCode
 
@@ -25,12 +24,6 @@ def compared(**runs):
             for name, reports in runs.items()
         },
     )
-
-
-def test_a_curve_has_the_evaluations_that_tell_a_return():
-    told = {"eval/episode_return": 2.0, "eval/return_low": 1.0, "eval/return_high": 3.0}
-    history = [(2048, told), (0, {**told, "eval/episode_return": 0.5}), (4096, {"ppo/loss": 1.0})]
-    assert return_curve(history) == (ReturnPoint(0, 0.5, 1.0, 3.0), ReturnPoint(2048, 2.0, 1, 3))
 
 
 def test_one_seed_is_evaluated_over_its_episodes():
