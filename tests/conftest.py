@@ -59,8 +59,10 @@ import jax
 import pytest
 
 from helpers.durations import (  # noqa: F401
+    pytest_runtest_logreport,
     pytest_runtest_logstart,
     pytest_runtest_makereport,
+    pytest_sessionfinish,
     pytest_terminal_summary,
 )
 from helpers.stack import OneChunk

@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+LIMIT = 75
+"""Processor time of `make test` in a clean clone, at most [min]; CONTRIBUTING.md promises it."""
+
 SHOWN = 25
 """Tests that are named."""
 
@@ -42,18 +45,34 @@ def pytest_runtest_makereport(item, call):
     return report
 
 
-def pytest_terminal_summary(terminalreporter):
+_costs = collections.Counter()
+
+
+def pytest_runtest_logreport(report):
+    """Add the cost of setting a test up, running it or tearing it down."""
+    _costs[report.nodeid] += getattr(report, "cpu_seconds", 0.0)  # that of a crash has none
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionfinish(session, exitstatus):
+    """Let a run fail that took longer than is promised."""
+    if exitstatus == pytest.ExitCode.OK and too_long(session.config.option.markexpr):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def too_long(marks):
+    """Whether `make test`, which selects tests by these marks, took longer than is promised."""
+    return marks == "not slow" and _costs.total() > 60 * LIMIT
+
+
+def pytest_terminal_summary(terminalreporter, config):
     """Print the costs of this run."""
-    costs = collections.Counter()
-    for reports in terminalreporter.stats.values():
-        for report in reports:
-            # The reports on setting up, running and tearing down; other entries lack `cpu_seconds`.
-            if hasattr(report, "cpu_seconds"):
-                costs[report.nodeid] += report.cpu_seconds
-    if costs:
+    if _costs:
         terminalreporter.section("processor time [s]")
-        for line in summary(costs):
+        for line in summary(_costs):
             terminalreporter.write_line(line)
+    if too_long(config.option.markexpr):
+        terminalreporter.write_line(f"error: the tests take more than {LIMIT} min", red=True)
 
 
 def summary(costs):

@@ -42,3 +42,17 @@ def functions(tree, prefix=""):
             if not isinstance(node, ast.ClassDef):
                 yield prefix + node.name, node
         yield from functions(node, name)
+
+
+def code_lines(text):
+    """Number of lines that are neither blank nor comments nor strings of their own."""
+    strings = {
+        number
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+        for number in range(node.lineno, node.end_lineno + 1)
+    }
+    lines = enumerate(map(str.strip, text.splitlines()), start=1)
+    return sum(bool(line) and line[0] != "#" and i not in strings for i, line in lines)

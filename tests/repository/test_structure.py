@@ -20,7 +20,7 @@ import pytest
 
 import jetbot_mjx
 import onekernel
-from helpers.source_tree import COMMON, ENGINE, PACKAGE, ROOT, imports, modules_of
+from helpers.source_tree import COMMON, ENGINE, PACKAGE, ROOT, code_lines, imports, modules_of
 from jetbot_mjx import __main__ as command_line
 
 ROOMS = (
@@ -350,20 +350,6 @@ def test_a_face_of_the_engine_is_small(face, most):
     assert set(module.__all__) <= {*exports(face)}
     for name in module.__all__:
         assert getattr(module, name) is not None
-
-
-def code_lines(text):
-    """Number of lines that are neither blank nor comments nor strings of their own."""
-    strings = {
-        number
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-        for number in range(node.lineno, node.end_lineno + 1)
-    }
-    lines = enumerate(map(str.strip, text.splitlines()), start=1)
-    return sum(bool(line) and line[0] != "#" and i not in strings for i, line in lines)
 
 
 def shares(sources):
