@@ -195,6 +195,18 @@ def tell(text: str) -> None:
     print(errors.printable_lines(text), flush=True)
 
 
+def tell_written(files: Sequence[Path], check: str) -> None:
+    """Tell which files were written to start from, and what can be done with the last of them.
+
+    Args:
+      files: the files, the configuration last.
+      check: the command that checks a configuration.
+    """
+    config = shlex.quote(str(files[-1]))
+    tell(f"wrote {' and '.join(map(str, files))}")
+    tell(f"next: {PROGRAM} {check} {config}\n      {PROGRAM} train {config}")
+
+
 def note(text: str) -> None:
     """Print a line for the user on standard error, where it does not mix with results."""
     print(errors.printable(text), file=sys.stderr, flush=True)
@@ -400,6 +412,29 @@ def origin(text: str) -> str:
     default = {"http": 80, "https": 443}[parts.scheme]
     host = f"[{name}]" if ":" in name else name
     return f"{parts.scheme}://{host}" + ("" if port in (None, default) else f":{port}")
+
+
+def write_page(
+    run: Path, output: Path | None, which: Literal["best", "last"] | int, *, trust: bool
+) -> Path:
+    """Write the page of a run, and tell what is in it.
+
+    Args:
+      run: the run, or one of its checkpoints.
+      output: the file to write; None: one in the run folder.
+      which: the checkpoint of a run.
+      trust: whether to run the code that the run names, whoever wrote it.
+
+    Returns:
+      The file.
+    """
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.deployment import summarize_web_page, write_web_page
+    prepare_device()
+    with trusting(trust), show_progress():
+        page = write_web_page(run, output, which=which)
+    tell(summarize_web_page(page))
+    return page.path
 
 
 def open_page(path: Path) -> None:

@@ -11,7 +11,6 @@ in any browser, and another one can be trained there. Nothing needs to be instal
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from jetbot_mjx import cli, startup
 
@@ -60,7 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("--format web writes a page, not a folder: give it alone")
     run = cli.find_policy(options.run)
     if _WEB in formats:
-        return _write_page(run, options)
+        cli.write_page(run, options.output, options.which, trust=options.trust)
+        return 0
     with startup.exit_on_interrupt():
         from jetbot_mjx.deployment import export_policy, summarize_export
     cli.prepare_device()
@@ -72,16 +72,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             output=options.output,
         )
     cli.tell(summarize_export(exported))
-    return 0
-
-
-def _write_page(run: Path, options: argparse.Namespace) -> int:
-    with startup.exit_on_interrupt():
-        from jetbot_mjx.deployment import summarize_web_page, write_web_page
-    cli.prepare_device()
-    with cli.trusting(options.trust), cli.show_progress():
-        page = write_web_page(run, options.output, which=options.which)
-    cli.tell(summarize_web_page(page))
     return 0
 
 

@@ -5,7 +5,6 @@ folder. It passes `check-env` and trains in seconds. No file is overwritten. A t
 written by `new-task`.
 """
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,9 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("module", type=Path, metavar="MODULE.py", help="file to be written")
     module = parser.parse_args(arguments).module
     config = write_environment_template(module)
-    cli.tell(f"wrote {module} and {config}")
-    cli.tell(f"next: jetbot-mjx check-env {shlex.quote(str(config))}")
-    cli.tell(f"      jetbot-mjx train {shlex.quote(str(config))}")
+    cli.tell_written((module, config), "check-env")
     return 0
 
 

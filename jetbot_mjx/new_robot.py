@@ -6,7 +6,6 @@ under your name, and `my_robot.yaml`, a configuration for it. All can be trained
 is overwritten.
 """
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,10 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = cli.Parser(prog="jetbot-mjx new-robot", description=__doc__)
     parser.add_argument("file", type=Path, metavar="FILE", help="a .yaml or .xml to be written")
     files = write_robot_template(parser.parse_args(arguments).file)
-    config = shlex.quote(str(files[-1]))
-    cli.tell(f"wrote {' and '.join(map(str, files))}")
-    cli.tell(f"next: jetbot-mjx check-robot {config}")
-    cli.tell(f"      jetbot-mjx train {config}")
+    cli.tell_written(files, "check-robot")
     return 0
 
 

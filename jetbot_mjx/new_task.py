@@ -4,7 +4,6 @@ It is the example `examples/obstacle_task.py` under your name, with its settings
 folder. Both pass `check-env` and can be trained unchanged. No file is overwritten.
 """
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,9 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("module", type=Path, metavar="MODULE.py", help="file to be written")
     module = parser.parse_args(arguments).module
     config = write_task_template(module)
-    cli.tell(f"wrote {module} and {config}")
-    cli.tell(f"next: jetbot-mjx check-env --config {shlex.quote(str(config))}")
-    cli.tell(f"      jetbot-mjx train {shlex.quote(str(config))}")
+    cli.tell_written((module, config), "check-env --config")
     return 0
 
 

@@ -4,8 +4,6 @@ Without RUN, a policy that comes with the package drives.
 """
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Literal
 
 from jetbot_mjx import cli, startup
 
@@ -61,7 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run = cli.find_policy(given or f"pretrained:{_DEFAULT_POLICY}")
     trust = options.pop("trust")
     if options.pop("web"):
-        return _open_page(run, options["which"], trust)
+        cli.open_page(cli.write_page(run, None, options["which"], trust=trust))
+        return 0
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import play_live
     cli.prepare_device()
@@ -70,18 +69,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with cli.trusting(trust):
         successes, episodes = play_live(run, **options, tell=cli.tell)
     cli.tell(f"{successes} of {episodes} goals reached")
-    return 0
-
-
-def _open_page(run: Path, which: Literal["best", "last"] | int, trust: bool) -> int:
-    """Write the page of a run, and open it in the browser."""
-    with startup.exit_on_interrupt():
-        from jetbot_mjx.deployment import summarize_web_page, write_web_page
-    cli.prepare_device()
-    with cli.trusting(trust), cli.show_progress():
-        page = write_web_page(run, which=which)
-    cli.tell(summarize_web_page(page))
-    cli.open_page(page.path)
     return 0
 
 

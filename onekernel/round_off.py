@@ -22,7 +22,7 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 from jaxtyping import Array, Bool, Float, UInt32
 
-from onekernel.lower import scan_ends
+from onekernel.lower import call_of, scan_ends
 
 _NOISE = 2 * float(np.finfo(np.float32).eps)
 """Largest relative change of a number: 2 to 4 units in the last place."""
@@ -60,14 +60,6 @@ _SUMS = _SOLVERS | frozenset(
     }
 )
 """Names of the primitives whose results are each made of many numbers, and rounded on the way."""
-
-_CALLS = frozenset(
-    {
-        *("checkpoint", "closed_call", "custom_jvp_call", "custom_vjp_call", "eval_jaxpr", "jit"),
-        *("pjit", "remat2"),
-    }
-)
-"""Names of the primitives that call a function once."""
 
 
 def noisy(function: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
@@ -128,10 +120,8 @@ class _Evaluation:
         name, params = equation.primitive.name, equation.params
         if call := getattr(self, f"_{name}", None):
             return call(equation, operands)
-        if name in _CALLS:
-            inner = params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"]
-            closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-            return self.run(closed, operands)
+        if called := call_of(equation, operands):
+            return self.run(*called)
 
         def bind(given: Sequence[Array]) -> Sequence[Array]:
             found = equation.primitive.bind(*given, **params)
@@ -188,14 +178,6 @@ class _Evaluation:
         branches = equation.params["branches"]
         functions = [lambda *given, one=one: self.run(one, given) for one in branches]
         return jax.lax.switch(operands[0].astype(jnp.int32), functions, *operands[1:])
-
-    def _custom_linear_solve(self, equation: JaxprEqn, operands: list[Array]) -> list[Array]:
-        # The operands are the constants of four functions, of which only `solve` runs, then the
-        # right-hand sides.
-        lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
-        first = lengths.matvec + lengths.vecmat
-        right = operands[first + lengths.solve + lengths.transpose_solve :]
-        return self.run(solve, [*operands[first : first + lengths.solve], *right])
 
 
 @jax.jit

@@ -19,7 +19,7 @@ import numpy as np
 
 import onekernel
 from jetbot_mjx import fallbacks
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import CHANGEABLE_ON_RESUME, Config
 from jetbot_mjx.devices import compiler_options
 from jetbot_mjx.envs.versions import LIBRARIES, installed_version
 
@@ -36,16 +36,9 @@ BUILT_IN_TASKS = frozenset({f"{_ROOTS[0].name}:GoalTask"})
 """Tasks whose source is part of the package, and so of the key."""
 
 _NOT_IN_PROGRAMS = {
-    # The seed is an argument of the programs.
-    "seed",
-    "init_from",
-    "stop_at_success",
-    "stop_at_return",
-    "checkpoint_interval",
-    "checkpoints_to_keep",
-    "preemption_notice",
-    "tensorboard",
-    "wandb",
+    # The seed is an argument of the programs. The length of the training is in them.
+    *("seed", "init_from"),
+    *(key for key in CHANGEABLE_ON_RESUME if "." not in key),
 }
 """Settings that no program depends on: when a training ends, and what it reads and writes."""
 

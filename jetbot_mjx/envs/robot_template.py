@@ -4,6 +4,7 @@ from importlib import resources
 from pathlib import Path
 
 from jetbot_mjx.config import shipped_folder
+from jetbot_mjx.envs.task_template import check_new, write_new
 from jetbot_mjx.errors import UserError
 
 _MODEL = "turtlebot"
@@ -56,17 +57,8 @@ def write_robot_template(path: Path) -> list[Path]:
             " as my_robot.xml"
         )
     texts = {path: _measures()} if path.suffix == ".yaml" else _model(path)
-    for file in texts:
-        if file.exists():
-            raise UserError(f"{file} exists already: choose another name")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for file, text in texts.items():
-            # Mode "x" does not overwrite a file that was created in the meantime.
-            with file.open("x", encoding="utf-8") as out:
-                out.write(text)
-    except OSError as error:
-        raise UserError(f"{error.filename}: {error.strerror}") from None
+    check_new(texts)
+    write_new(texts)
     return list(texts)
 
 

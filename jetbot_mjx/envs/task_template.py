@@ -2,6 +2,7 @@
 
 import importlib.util
 import keyword
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from jetbot_mjx.config import shipped_folder
@@ -54,9 +55,7 @@ def _write(path: Path, example: Path, settings: str) -> Path:
         raise UserError(f"{path}: name a Python module, such as my_{kind}.py")
     config = path.with_suffix(".yaml")
     copies = {path: example, config: example.with_name(f"{settings}.yaml")}
-    for file in copies:
-        if file.exists():
-            raise UserError(f"{file} exists already: choose another name")
+    check_new(copies)
     if importlib.util.find_spec(name) is not None:
         raise UserError(f"{path}: a module {name} exists already: choose another name")
     # Copy the example under the new names.
@@ -66,18 +65,38 @@ def _write(path: Path, example: Path, settings: str) -> Path:
         example.stem: name,
         _class_name(example.stem): _class_name(name),
     }
+    texts = {file: source.read_text("utf-8") for file, source in copies.items()}
+    for old, new in renamed.items():
+        texts = {file: text.replace(old, new) for file, text in texts.items()}
+    write_new(texts)
+    return config
+
+
+def check_new(files: Iterable[Path]) -> None:
+    """Raise an error if one of the files exists.
+
+    Raises:
+      UserError: it does.
+    """
+    for file in files:
+        if file.exists():
+            raise UserError(f"{file} exists already: choose another name")
+
+
+def write_new(texts: Mapping[Path, str]) -> None:
+    """Write files, none of which exists, and the folder of the first.
+
+    Raises:
+      UserError: one cannot be written.
+    """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for file, source in copies.items():
-            text = source.read_text("utf-8")
-            for old, new in renamed.items():
-                text = text.replace(old, new)
+        next(iter(texts)).parent.mkdir(parents=True, exist_ok=True)
+        for file, text in texts.items():
             # Mode "x" does not overwrite a file that was created in the meantime.
             with file.open("x", encoding="utf-8") as out:
                 out.write(text)
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None
-    return config
 
 
 def _class_name(module: str) -> str:

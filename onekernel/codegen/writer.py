@@ -38,7 +38,7 @@ import dataclasses
 import functools
 import re
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 _MAX_ACCESSES = 256
 """Most accesses of memory in a row in one block."""
@@ -139,6 +139,27 @@ def _width(element: str) -> int:
     return _WIDTHS.get(element) or int(element[1:])
 
 
+def _binary(
+    operator: str, *, swapped: bool = False
+) -> Callable[["Value", "Value | Number"], "Value"]:
+    """Return a method that applies an operator to a value and another one, or the reverse."""
+
+    def apply(self: "Value", other: "Value | Number") -> "Value":
+        # A number of Python takes the type of the other operand.
+        if not isinstance(other, Value):
+            other = self.writer.constant(other, self.type)
+        elif other.type != self.type:
+            raise TypeError(f"{self.type} {operator} {other.type}")
+        first, second = (other, self) if swapped else (self, other)
+        instruction, result = _instruction(operator, self.type)
+        return self.writer.let(f"{instruction} {first.text}, {second.text}", result)
+
+    return apply
+
+
+_plus = _binary("+")
+
+
 @dataclasses.dataclass(eq=False, slots=True)
 class Value:
     """A `Value` is a number, a vector or an address in a register, or a constant."""
@@ -157,94 +178,42 @@ class Value:
         """Raise TypeError: whether a value is true is known only when the function runs."""
         raise TypeError("a Value is known when the function runs: use select or when")
 
-    def _apply(self, operator: str, other: "Value | Number", *, swapped: bool = False) -> "Value":
-        # A number of Python takes the type of the other operand.
-        if not isinstance(other, Value):
-            other = self.writer.constant(other, self.type)
-        elif other.type != self.type:
-            raise TypeError(f"{self.type} {operator} {other.type}")
-        first, second = (other, self) if swapped else (self, other)
-        instruction, result = _instruction(operator, self.type)
-        return self.writer.let(f"{instruction} {first.text}, {second.text}", result)
-
     def __add__(self, other: "Value | Number") -> "Value":
         """Return a sum; an address plus n is the address n floats further."""
         if _kind(self.type) == "p":
             return self.at(other) if isinstance(other, Value) or other else self
-        return self._apply("+", other)
+        return _plus(self, other)
 
-    def __radd__(self, other: Number) -> "Value":
-        return self._apply("+", other, swapped=True)
-
-    def __sub__(self, other: "Value | Number") -> "Value":
-        return self._apply("-", other)
-
-    def __rsub__(self, other: Number) -> "Value":
-        return self._apply("-", other, swapped=True)
-
-    def __mul__(self, other: "Value | Number") -> "Value":
-        return self._apply("*", other)
-
-    def __rmul__(self, other: Number) -> "Value":
-        return self._apply("*", other, swapped=True)
-
-    def __truediv__(self, other: "Value | Number") -> "Value":
-        return self._apply("/", other)
-
-    def __rtruediv__(self, other: Number) -> "Value":
-        return self._apply("/", other, swapped=True)
-
-    def __floordiv__(self, other: "Value | Number") -> "Value":
-        """Return the quotient of two integers, rounded towards zero."""
-        return self._apply("//", other)
-
-    def __mod__(self, other: "Value | Number") -> "Value":
-        """Return the rest of `//`, with the sign of the dividend."""
-        return self._apply("%", other)
-
-    def __and__(self, other: "Value | Number") -> "Value":
-        return self._apply("&", other)
-
-    def __or__(self, other: "Value | Number") -> "Value":
-        return self._apply("|", other)
-
-    def __xor__(self, other: "Value | Number") -> "Value":
-        return self._apply("^", other)
-
-    def __lshift__(self, other: "Value | Number") -> "Value":
-        return self._apply("<<", other)
-
-    def __rshift__(self, other: "Value | Number") -> "Value":
-        return self._apply(">>", other)
-
-    def __lt__(self, other: "Value | Number") -> "Value":
-        return self._apply("<", other)
-
-    def __le__(self, other: "Value | Number") -> "Value":
-        return self._apply("<=", other)
-
-    def __gt__(self, other: "Value | Number") -> "Value":
-        return self._apply(">", other)
-
-    def __ge__(self, other: "Value | Number") -> "Value":
-        return self._apply(">=", other)
+    __radd__ = _binary("+", swapped=True)
+    __sub__ = _binary("-")
+    __rsub__ = _binary("-", swapped=True)
+    __mul__ = _binary("*")
+    __rmul__ = _binary("*", swapped=True)
+    __truediv__ = _binary("/")
+    __rtruediv__ = _binary("/", swapped=True)
+    # The quotient of two integers is rounded towards zero; the rest has the dividend's sign.
+    __floordiv__ = _binary("//")
+    __mod__ = _binary("%")
+    __and__ = _binary("&")
+    __or__ = _binary("|")
+    __xor__ = _binary("^")
+    __lshift__ = _binary("<<")
+    __rshift__ = _binary(">>")
+    __lt__ = _binary("<")
+    __le__ = _binary("<=")
+    __gt__ = _binary(">")
+    __ge__ = _binary(">=")
+    equals = _binary("==")
+    differs = _binary("!=")
 
     def __neg__(self) -> "Value":
         # Not 0 - x, which of 0 would be 0 instead of -0.
         if _kind(self.type) == "f":
             return self.writer.let(f"fneg {self.typed}", self.type)
-        return self._apply("-", 0, swapped=True)
+        return self.__rsub__(0)
 
     def __invert__(self) -> "Value":
-        return self._apply("^", True)
-
-    def equals(self, other: "Value | Number") -> "Value":
-        """Return whether two numbers are equal."""
-        return self._apply("==", other)
-
-    def differs(self, other: "Value | Number") -> "Value":
-        """Return whether two numbers differ."""
-        return self._apply("!=", other)
+        return self ^ True
 
     def to(self, element: str) -> "Value":
         """Return the number, or each of a vector, converted to another type."""

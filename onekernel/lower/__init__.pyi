@@ -1,4 +1,5 @@
 from .control_flow import MAX_ARRAY_BYTES as MAX_ARRAY_BYTES
+from .control_flow import call_of as call_of
 from .control_flow import scan_ends as scan_ends
 from .evaluation import evaluate as evaluate
 from .jaxpr import LateProgram as LateProgram

@@ -16,6 +16,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
@@ -53,6 +54,14 @@ MIN_BRANCH_OPERATIONS = 24
 """Smallest number of operations for which a branch is faster than computing both sides."""
 
 _INT = np.dtype(np.int32)
+_Operand = TypeVar("_Operand")
+CALLS = frozenset(
+    {
+        *("checkpoint", "closed_call", "custom_jvp_call", "custom_linear_solve"),
+        *("custom_vjp_call", "eval_jaxpr", "jit", "pjit", "remat2"),
+    }
+)
+"""Names of the primitives that call a function once."""
 
 
 def check_bytes(count: int) -> None:
@@ -73,6 +82,33 @@ def scan_ends(equation: JaxprEqn) -> tuple[int, int]:
     )
     last = len(equation.invars) - scanned
     return last - (len(equation.outvars) - stacked), last
+
+
+def call_of(
+    equation: JaxprEqn, operands: Sequence[_Operand]
+) -> tuple[ClosedJaxpr, Sequence[_Operand]] | None:
+    """Return the function that an operation calls once, and its arguments; None if it calls none.
+
+    `jax.checkpoint` computes values again in the backward pass instead of storing them. Here all
+    values are registers, and equal operations are recorded once.
+
+    Args:
+      equation: the operation.
+      operands: its operands.
+    """
+    params = equation.params
+    if equation.primitive.name not in CALLS:
+        return None
+    if equation.primitive.name == "custom_linear_solve":
+        # The operands are the constants of four functions (matvec, vecmat, solve, transpose_solve),
+        # then the right-hand sides. Only `solve` runs here; the others serve checks and
+        # derivatives.
+        lengths = params["const_lengths"]
+        first = lengths.matvec + lengths.vecmat
+        right = operands[first + lengths.solve + lengths.transpose_solve :]
+        return params["jaxprs"].solve, [*operands[first : first + lengths.solve], *right]
+    inner = params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"]
+    return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), operands
 
 
 @dataclasses.dataclass(frozen=True)

@@ -39,7 +39,7 @@ from numpy.typing import ArrayLike
 
 from onekernel.errors import UnsupportedError
 from onekernel.lower.arithmetic import ARITHMETIC_RULES, bitcast, elementwise
-from onekernel.lower.control_flow import ControlFlow, check_bytes
+from onekernel.lower.control_flow import CALLS, ControlFlow, call_of, check_bytes
 from onekernel.lower.dynamic_indexing import DYNAMIC_RULES, scatter
 from onekernel.lower.expansions import EXPANSIONS, power, round_away_from_zero
 from onekernel.lower.indexing import (
@@ -257,7 +257,7 @@ def scalarize_part(
 
 def primitives() -> dict[str, list[str]]:
     """Return the names of the JAX primitives that have a rule, by what the rule does."""
-    own = (name[1:] for name in dir(_JaxprLowering(ExprGraph())) if name[:2] != "__")
+    own = [name[1:] for name in dir(_JaxprLowering(ExprGraph())) if name[:2] != "__"]
     kinds = {
         "an operation for each element": EVALUATE,
         "scalars rearranged, nothing computed": RULES,
@@ -265,7 +265,7 @@ def primitives() -> dict[str, list[str]]:
         "indices known only at run time, sorting": DYNAMIC_RULES,
         "random numbers": RANDOM_RULES,
         "a formula of other operations": EXPANSIONS,
-        "loops, branches, calls, linear algebra": own,
+        "loops, branches, calls, linear algebra": [*own, *CALLS],
     }
     public = {x.name for x in vars(jex.primitives).values() if isinstance(x, jex.Primitive)}
     found: dict[str, list[str]] = {}
@@ -338,6 +338,8 @@ class _JaxprLowering:
             raise
 
     def _apply_rule(self, equation: JaxprEqn, operands: list[ScalarArray]) -> list[ScalarArray]:
+        if call := call_of(equation, operands):
+            return self.lower(*call)
         name = equation.primitive.name
         # Most operations on single elements have the same name in JAX and in the graph, and need
         # no rule of their own.
@@ -381,13 +383,6 @@ class _JaxprLowering:
 
         return self.lower(jax.make_jaxpr(expanded)(*(x.aval for x in equation.invars)), operands)
 
-    # Rules of primitives that call functions.
-
-    def _jit(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
-        return self.lower(equation.params["jaxpr"], operands)
-
-    _pjit = _jit
-
     def _scatter(
         self, equation: JaxprEqn, *operands: ScalarArray
     ) -> ScalarArray | list[ScalarArray]:
@@ -402,33 +397,12 @@ class _JaxprLowering:
 
         return scatter(self._graph, equation, *operands, combine=combine)
 
-    def _custom_jvp_call(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
-        return self.lower(equation.params["call_jaxpr"], operands)
-
-    _custom_vjp_call = _closed_call = _eval_jaxpr = _custom_jvp_call
-
     def _platform_index(self, equation: JaxprEqn) -> ScalarArray:
         # `jax.lax.platform_dependent`: choose the case that is written for all platforms, whose
         # names are None. A scalar program does not know which platform it is for.
         platforms = equation.params["platforms"]
         index = next((i for i, names in enumerate(platforms) if names is None), len(platforms) - 1)
         return constant_array(np.int32(index))
-
-    def _remat2(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
-        # `jax.checkpoint` computes values again in the backward pass instead of storing them. Here
-        # all values are registers, and equal operations are recorded once.
-        return self.lower(ClosedJaxpr(equation.params["jaxpr"], ()), operands)
-
-    _checkpoint = _remat2
-
-    def _custom_linear_solve(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
-        # The operands are the constants of four functions (matvec, vecmat, solve, transpose_solve),
-        # then the right-hand sides. Only `solve` runs here; the others serve checks and
-        # derivatives.
-        lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
-        first = lengths.matvec + lengths.vecmat
-        right = operands[first + lengths.solve + lengths.transpose_solve :]
-        return self.lower(solve, [*operands[first : first + lengths.solve], *right])
 
     def _round(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         if equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
