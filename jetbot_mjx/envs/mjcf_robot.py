@@ -4,7 +4,7 @@ Every message names what is wrong in the user's file and what would be right.
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -78,77 +78,70 @@ def load_spec(robot: MjcfRobotConfig) -> mujoco.MjSpec:
         )
     try:
         spec = parse_model(robot.file, files)
-        _check_joints(robot, spec)
+        _refuse(robot, _joint_problems(spec))
         # MuJoCo warns of a model that it cannot simulate, in the middle of other lines.
         with warnings.catch_warnings(category=UserWarning, action="error"):
             model = spec.copy().compile()
     except (ValueError, mujoco.FatalError, UserWarning) as error:
         raise RobotFileError(robot, f"MuJoCo refuses it: {error}") from None
-    _check_numbers(robot, model)
-    _check_computed(robot, model)
+    _refuse(robot, _number_problems(model))
+    _refuse(robot, _computing_problems(model))
     return spec
 
 
-def _check_joints(robot: MjcfRobotConfig, spec: mujoco.MjSpec) -> None:
-    """Check what MuJoCo would compile with a warning, and then not simulate."""
+def _refuse(robot: MjcfRobotConfig, problems: Iterator[str]) -> None:
+    """Raise an error that tells the first of the problems, if there is one."""
+    if problem := next(problems, None):
+        raise RobotFileError(robot, problem)
+
+
+def _joint_problems(spec: mujoco.MjSpec) -> Iterator[str]:
+    """Tell what MuJoCo would compile with a warning, and then not simulate."""
     for joint in spec.joints:
         for name in ("armature", "damping", "frictionloss"):
             if (least := float(np.min(getattr(joint, name)))) < 0.0:
-                raise RobotFileError(
-                    robot,
-                    f"{joint.name or 'a joint'} has the {name} {least:g}: it should be 0 or more",
-                )
+                yield f"{joint.name or 'a joint'} has the {name} {least:g}: it should be 0 or more"
 
 
-def _check_computed(robot: MjcfRobotConfig, model: mujoco.MjModel) -> None:
-    """Check that a robot has nothing that C MuJoCo computes and MJX leaves out, unsaid."""
+def _computing_problems(model: mujoco.MjModel) -> Iterator[str]:
+    """Tell what C MuJoCo computes of a robot and MJX leaves out, unsaid."""
     for name, what in _ONLY_IN_C.items():
         if np.any(getattr(model, name)):
-            raise RobotFileError(robot, f"MJX does not compute {what}: leave it out")
+            yield f"MJX does not compute {what}: leave it out"
     limited = model.actuator_forcelimited.any() or model.jnt_actfrclimited.any()
     if limited and model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
-        raise RobotFileError(
-            robot,
+        yield (
             "with the integrator implicitfast MJX does not compute motors at their limits"
-            " (forcerange, actuatorfrcrange) as MuJoCo does: leave the integrator out",
+            " (forcerange, actuatorfrcrange) as MuJoCo does: leave the integrator out"
         )
 
 
-def _check_numbers(robot: MjcfRobotConfig, model: mujoco.MjModel) -> None:
-    """Check that a robot has numbers with which it can be simulated, in the right units."""
+def _number_problems(model: mujoco.MjModel) -> Iterator[str]:
+    """Tell with which numbers a robot cannot be simulated, such as those in other units."""
     for name in ("body_mass", "body_inertia", "body_pos", "jnt_pos", "geom_pos", "geom_size"):
         if not np.isfinite(getattr(model, name)).all():
             part, _, what = name.partition("_")
-            raise RobotFileError(
-                robot, f"the {what} of a {_PARTS[part]} is infinite: give a finite number"
-            )
+            yield f"the {what} of a {_PARTS[part]} is infinite: give a finite number"
     for name in ("body_pos", "jnt_pos", "geom_pos", "geom_size"):
         if (farthest := float(np.abs(getattr(model, name)).max(initial=0.0))) > _LARGEST_LENGTH:
             part, _, what = name.partition("_")
-            raise RobotFileError(
-                robot,
+            yield (
                 f"the {what} of a {_PARTS[part]} has a length of {farthest:.3g} m: lengths are in"
-                " metres (millimetres are metres × 0.001)",
+                " metres (millimetres are metres × 0.001)"
             )
     for name in _SOLREFS:
         first, second = (getattr(model, name) > 0.0).T
         if np.any(first != second):
-            raise RobotFileError(
-                robot,
+            yield (
                 f"a {name.partition('_')[0]} has a solref of which one number is above 0 and one is"
-                " not: give two above 0, or two below",
+                " not: give two above 0, or two below"
             )
     if (mass := float(model.body_mass.sum())) > _LARGEST_MASS:
-        raise RobotFileError(
-            robot,
-            f"it weighs {mass:,.0f} kg: masses are in kilograms (grams are kilograms × 0.001)",
-        )
+        yield f"it weighs {mass:,.0f} kg: masses are in kilograms (grams are kilograms × 0.001)"
     if not model.opt.gravity[2] < 0.0:
         gravity = " ".join(f"{x:g}" for x in model.opt.gravity)
-        raise RobotFileError(
-            robot,
-            f"its gravity is ({gravity}), which does not hold it on the floor: (0 0 -9.81) is"
-            " right",
+        yield (
+            f"its gravity is ({gravity}), which does not hold it on the floor: (0 0 -9.81) is right"
         )
 
 
@@ -183,32 +176,32 @@ def find_base(robot: MjcfRobotConfig, spec: mujoco.MjSpec) -> mujoco.MjsBody:
         for body in spec.worldbody.bodies
         if any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
     ]
+    _refuse(robot, _base_problems(robot, free))
+    return next(body for body in free if robot.base in (None, body.name))
+
+
+def _base_problems(robot: MjcfRobotConfig, free: Sequence[mujoco.MjsBody]) -> Iterator[str]:
+    """Tell why none of the bodies with a free joint is the robot's base."""
     names = [body.name for body in free]
     if not free:
-        raise RobotFileError(
-            robot,
+        yield (
             "no body of the world has a free joint, so that the robot cannot move: add <freejoint/>"
-            " to its base",
+            " to its base"
         )
     if "" in names:
-        raise RobotFileError(robot, "the body with a free joint has no name: give it one")
+        yield "the body with a free joint has no name: give it one"
     if any(body.frame is not None for body in free):
-        raise RobotFileError(
-            robot, "the body with a free joint is in a <frame>: put it into <worldbody> itself"
-        )
+        yield "the body with a free joint is in a <frame>: put it into <worldbody> itself"
     if robot.base is None and len(free) > 1:
-        raise RobotFileError(
-            robot,
+        yield (
             f"{len(free)} bodies have a free joint ({', '.join(names)}): name the robot's by"
-            " robot.base, and leave the others out",
+            " robot.base, and leave the others out"
         )
     if robot.base is not None and robot.base not in names:
-        raise RobotFileError(
-            robot,
+        yield (
             f"robot.base = {robot.base!r} is no body of the world with a free joint: there is"
-            f" {', '.join(names)}",
+            f" {', '.join(names)}"
         )
-    return free[0] if robot.base is None else free[names.index(robot.base)]
 
 
 def add_robot(scene: mujoco.MjSpec, robot: MjcfRobotConfig) -> None:
