@@ -56,13 +56,13 @@ from onekernel.lower.linear_algebra import MAX_ROWS, expansion
 from onekernel.lower.random_rules import RANDOM_RULES
 from onekernel.lower.scalar_ir import (
     EVALUATE,
-    SIMPLE_POWERS,
     ExprGraph,
     Scalar,
     is_constant,
     length_of,
 )
 from onekernel.lower.schedule import Block, schedule
+from onekernel.lower.simplify import SIMPLE_POWERS, make_graph
 
 MAX_PROGRAM_OPERATIONS = 100_000
 """Largest number of operations of a program; LLVM takes 15 s to compile that many for a CPU."""
@@ -227,7 +227,7 @@ def scalarize_part(
         error.place = next((_place(x) for x in closed.jaxpr.eqns if x.effects), None)
         raise error
     # Start with the program's arguments, each split into scalars of the graph.
-    graph = ExprGraph(finite=finite, approximate=approximate)
+    graph = make_graph(finite=finite, approximate=approximate)
     lowering = _JaxprLowering(graph)
     env: dict[Var, ScalarArray] = {}
     inputs = []
@@ -257,7 +257,7 @@ def scalarize_part(
 
 def primitives() -> dict[str, list[str]]:
     """Return the names of the JAX primitives that have a rule, by what the rule does."""
-    own = [name[1:] for name in dir(_JaxprLowering(ExprGraph())) if name[:2] != "__"]
+    own = [name[1:] for name in dir(_JaxprLowering(make_graph())) if name[:2] != "__"]
     kinds = {
         "an operation for each element": EVALUATE,
         "scalars rearranged, nothing computed": RULES,

@@ -2,8 +2,13 @@
 
 import numpy as np
 
+from onekernel.lower.indexing import scalar_array
+from onekernel.lower.jaxpr import ScalarProgram
 from onekernel.lower.scalar_ir import EVALUATE, convert_constant, is_constant
-from onekernel.lower.schedule import PlacedBranch, PlacedLoop
+from onekernel.lower.schedule import PlacedBranch, PlacedLoop, schedule
+
+# Words at the ends of what integers hold, and around what float32 holds of them.
+WORDS = np.uint32([0, 1, 7, 2**24 + 1, 2**31 - 1, 2**31, 2**31 + 129, 2**32 - 129, 2**32 - 1])
 
 
 def evaluate(program, leaves):
@@ -21,6 +26,15 @@ def evaluate(program, leaves):
         (np.stack(found, -1) if found else np.zeros(0)).reshape(*batch, *array.shape)
         for found, array in zip(columns, program.outputs, strict=True)
     ]
+
+
+def evaluate_scalar(result, *inputs):
+    """What one value comes to, of inputs and the numbers that each of them has."""
+    values, columns = zip(*inputs, strict=True)
+    leaves = [scalar_array([value], ()) for value in values]
+    program = ScalarProgram(leaves, [scalar_array([result], ())], schedule([result]))
+    (ends,) = evaluate(program, columns)
+    return ends
 
 
 class _Evaluation:

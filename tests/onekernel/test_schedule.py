@@ -3,20 +3,10 @@
 import numpy as np
 import pytest
 
-from onekernel.lower.scalar_ir import Expr, ExprGraph
+from onekernel.lower.scalar_ir import Expr
 from onekernel.lower.schedule import PlacedBranch, PlacedLoop, recomputable, schedule
 
 ONE = np.float32(1)
-
-
-@pytest.fixture
-def graph():
-    return ExprGraph()
-
-
-@pytest.fixture
-def x(graph):
-    return graph.input(np.float32)
 
 
 @pytest.fixture
