@@ -28,7 +28,7 @@ from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.metrics import CompileClock
 from jetbot_mjx.runs.run_dir import write_json
-from jetbot_mjx.training import ppo_trainer, session
+from jetbot_mjx.training import composition, ppo_trainer, session
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
 from jetbot_mjx.training.run_recorder import RunRecorder
@@ -116,7 +116,7 @@ def _train_once(config: Config, env: Any, program: ppo_trainer.CompiledTrainer, 
         else:
             kind = _LogsAndCheckpoints if mode == "saved" else _LogsOnly
             run_dir, setup = Path(folder), Setup(config, env=env)
-            parts = session.Training(
+            parts = composition.Training(
                 setup=setup, run_dir=run_dir, run_dirs=[run_dir], ppo=program.ppo
             )
             with (

@@ -7,6 +7,6 @@ from .memory import plan_memory as plan_memory
 from .ppo_trainer import CompiledTrainer as CompiledTrainer
 from .preemption import STOPPED as STOPPED
 from .preemption import Preemption as Preemption
-from .session import Result as Result
-from .session import closing_message as closing_message
+from .result import Result as Result
+from .result import closing_message as closing_message
 from .session import run as run

@@ -1,26 +1,22 @@
-"""Compose a training from its configuration and run it into its run folder.
+"""Run a training, composed from its configuration, into its run folder.
 
-This module is the composition root: `run` builds environment, networks, programs and PPO once, and
-`open_recorder` builds the evaluator, the video, the terminal and the logs. All other modules
-receive what they need as required arguments.
+`compose` builds environment, networks, programs and PPO once, and `open_recorder` builds the
+evaluator, the video, the terminal and the logs. All other modules receive what they need as
+required arguments.
 """
 
 import contextlib
-import dataclasses
 import functools
-import importlib.util
 import shlex
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, UInt32
 
 from jetbot_mjx import envs, runs
-from jetbot_mjx.agents import PPO, PolicyParams, TrainState
+from jetbot_mjx.agents import PolicyParams, TrainState
 from jetbot_mjx.config import Config, ConfigError
 from jetbot_mjx.envs import AdaptedEnv
 from jetbot_mjx.errors import UserError, lost_device, ran_out
@@ -33,93 +29,19 @@ from jetbot_mjx.evaluation import (
     summarize_returns,
     training_keys,
 )
-from jetbot_mjx.fallbacks import Fallback, collect
+from jetbot_mjx.fallbacks import collect
 from jetbot_mjx.interrupts import tell
-from jetbot_mjx.runs import CompileClock, Resumption, Setup, TaskCode, WarmStart, checkpoint_steps
+from jetbot_mjx.runs import CompileClock, Resumption, Setup, checkpoint_steps
 from jetbot_mjx.training import distributed, ppo_trainer
 from jetbot_mjx.training.callbacks import TrainerCallback
+from jetbot_mjx.training.composition import Training, compose
 from jetbot_mjx.training.console import SilentTerminal
 from jetbot_mjx.training.memory import MemoryModel, device_memory, sizes
 from jetbot_mjx.training.preemption import DeferredSignals, StopRequest
+from jetbot_mjx.training.result import Result, complete_message, stop_message
 from jetbot_mjx.training.run_recorder import RunRecorder, SeedRecorder, Standing, open_sinks
 from jetbot_mjx.training.terminal import open_terminal
 from onekernel import ProgramCache
-
-
-class Result(NamedTuple):
-    """A `Result` holds the result of a training; of several processes only the first has it all."""
-
-    run_dir: Path
-    run_dirs: Sequence[Path]
-    """The folder of each seed, which is the run folder if there is only one seed."""
-    standings: list[Standing]
-    """The progress of each seed; empty in all processes but the first."""
-    fingerprints: list[str]
-    """SHA-256 of each seed's last parameters, which are the same for the same seed; empty in all
-    processes but the first."""
-    finished: bool
-    """Whether the training came to its end; otherwise the same command resumes it."""
-    wall_seconds: float
-    """Time spent on the training, in all processes [s]."""
-    next_commands: Sequence[str] = ("evaluate", "render", "play")
-    """Commands for its policies, the first of which takes several seeds."""
-
-    def __repr__(self) -> str:
-        """Return the folder and the best evaluation of each seed in one line."""
-        scores = [told_score(one.best) if one.best else "-" for one in self.standings]
-        return (
-            f"Result(run_dir={str(self.run_dir)!r}, best={', '.join(scores) or '-'},"
-            f" finished={self.finished})"
-        )
-
-    @property
-    def history(self) -> list[runs.History]:
-        """Return the metrics of the first seed, one entry for each line of its `metrics.jsonl`."""
-        return runs.read_history(self.run_dirs[0] / runs.METRICS)
-
-    @property
-    def best(self) -> Summary | ReturnSummary:
-        """Return the metrics of the first seed's best checkpoint."""
-        assert self.standings[0].best is not None
-        return self.standings[0].best
-
-    @property
-    def best_steps(self) -> int:
-        """Return the environment steps of the first seed's best checkpoint."""
-        return self.standings[0].best_steps
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Training:
-    """A `Training` holds the objects that a training is composed of, each built once."""
-
-    setup: Setup
-    """Configuration, environment, networks and programs, also those of evaluations and videos."""
-    run_dir: Path
-    run_dirs: Sequence[Path]
-    """The folder of each seed."""
-    ppo: PPO
-    """PPO over all devices."""
-    warm_start: WarmStart | None = None
-    """The parameters to begin with; None: those of the seed, or the run is resumed."""
-    fallbacks: Sequence[Fallback] = ()
-    """Parts that run slower than they could; others are added while programs are traced."""
-    task_code: TaskCode | None = None
-    """The source of the task that the run stores; None: it has none, or it is stored already."""
-    hints: Sequence[str] = ()
-    """Settings without which a robot of a user's own may not learn."""
-    verbose: bool = True
-    """Whether to show the progress."""
-
-    @property
-    def config(self) -> Config:
-        """Return the configuration of the run."""
-        return self.setup.config
-
-    @functools.cached_property
-    def versions(self) -> runs.JsonObject:
-        """Return the versions that the folders of all seeds store."""
-        return runs.versions()
 
 
 def run(
@@ -165,7 +87,7 @@ def run(
     runs.check_tracking(config)
     # Build every object once, and train.
     with collect() as fallbacks:
-        training = _compose(config, run_dir, programs, fallbacks, keep=keep, verbose=verbose)
+        training = compose(config, run_dir, programs, fallbacks, keep=keep, verbose=verbose)
         try:
             if config.trainer == "brax":
                 result = _train_with_brax(training)
@@ -197,93 +119,6 @@ def _explain(error: Exception, training: Training) -> str:
         f"the device failed: {reason}: the training is saved after {saved:,} steps:"
         f" `jetbot-mjx train --resume {shlex.quote(str(run_dir))}` continues it from there"
     )
-
-
-def _compose(
-    config: Config,
-    run_dir: Path,
-    programs: ProgramCache,
-    fallbacks: Sequence[Fallback],
-    *,
-    keep: bool,
-    verbose: bool,
-) -> Training:
-    """Build every object of a training once."""
-    run_dirs = runs.seed_dirs(run_dir, config)
-    own_class, task_code = _find_code(config, run_dirs)
-    setup = Setup(config, programs, own_class=own_class)
-    if isinstance(setup.env, AdaptedEnv):
-        _check_targets(config, setup.env)
-    elif not envs.is_built_in(config.task.name):
-        envs.require_trainable(setup.env.task, config)
-    if keep and not envs.is_built_in(config.code):
-        # Only now it is known what the programs depend on.
-        setup.programs = envs.open_program_cache(config, own=envs.own_fingerprint(setup.env))
-    if isinstance(setup.env, AdaptedEnv) and not setup.programs.has("advance"):
-        # What was trained before has passed it.
-        envs.require_sound(setup.env)
-    hints = [] if isinstance(setup.env, AdaptedEnv) else envs.training_hints(setup.env)
-    ppo = ppo_trainer.build_ppo(setup)
-    # Another run's policy is loaded only for a run without checkpoints of its own.
-    warm_start = None
-    if config.init_from is not None and not _has_checkpoints(run_dirs):
-        warm_start = runs.make_warm_start(runs.load_checkpoint(config.init_from), setup)
-    return Training(
-        setup=setup,
-        run_dir=run_dir,
-        run_dirs=run_dirs,
-        ppo=ppo,
-        warm_start=warm_start,
-        fallbacks=fallbacks,
-        task_code=task_code,
-        hints=hints,
-        verbose=verbose,
-    )
-
-
-def _has_checkpoints(run_dirs: Sequence[Path]) -> bool:
-    """Return whether there is a run to continue; a folder that cannot be read is refused later."""
-    try:
-        return any(map(checkpoint_steps, run_dirs))
-    except OSError:
-        return False
-
-
-def _check_targets(config: Config, env: AdaptedEnv) -> None:
-    """Raise an error if a training cannot end, or show itself, as it is told to."""
-    if config.stop_at_success is not None and not env.has_success:
-        raise UserError(
-            f"stop_at_success = {config.stop_at_success}: environment = {config.environment!r} has"
-            " no metric 'success': use stop_at_return, or leave it out"
-        )
-    if config.evaluation.video and env.mj_model is None:
-        raise UserError(
-            f"evaluation.video = {config.evaluation.video!r}: environment = {config.environment!r}"
-            " has no `mj_model`, or its state no `qpos`: leave it out"
-        )
-
-
-def _find_code(config: Config, run_dirs: Sequence[Path]) -> tuple[type | None, TaskCode | None]:
-    """Return the class of the task or the environment if the run stores it, or its source to store.
-
-    A run that has checkpoints continues with the code that it was begun with. Of several processes,
-    all train with that of the first one, which sends its source to those that lack it.
-    """
-    primary = distributed.is_primary()
-    resumes = primary and _has_checkpoints(run_dirs)
-
-    def source() -> TaskCode | None:
-        if resumes:
-            return runs.require_trust(run_dirs[0], config)
-        return runs.collect_task_code(config.code)
-
-    sent = distributed.broadcast_from_primary(source) if jax.process_count() > 1 else None
-    own_class = runs.trusted_class(run_dirs[0], config) if resumes else None
-    if sent and not primary:
-        with tempfile.TemporaryDirectory() as folder:
-            runs.write_task_code(Path(folder), sent)
-            own_class = runs.stored_class(Path(folder), config.code, sent, silent=True)
-    return own_class, None if own_class else runs.collect_task_code(config.code)
 
 
 def _store_run(training: Training) -> None:
@@ -319,7 +154,7 @@ def _train(training: Training, stop: StopRequest) -> Result:
     recorder: RunRecorder | None = None
 
     def say_stopped() -> None:
-        text = stop_message(training)
+        text = stop_message(training.run_dir, training.run_dirs)
         runs.log_message(training.run_dir, text)
         tell(text)
 
@@ -341,7 +176,7 @@ def _train(training: Training, stop: StopRequest) -> Result:
             recorder = stack.enter_context(open_recorder(training, clock, resumption))
             if recorder.complete:
                 # Leave out the last message, which would say that the training resumes.
-                for line in (*messages[:-1], _complete_message(config, recorder.standings)):
+                for line in (*messages[:-1], complete_message(config, recorder.standings)):
                     recorder.say(line)
                 return True, []
             if training.warm_start:
@@ -525,16 +360,6 @@ def _result(training: Training, recorder: RunRecorder | None, *, finished: bool)
     return done._replace(next_commands=["evaluate", "export"] + ["render"] * bool(env.mj_model))
 
 
-def _complete_message(config: Config, standings: Sequence[Standing]) -> str:
-    """Return the line about a run that has nothing left to train, and how to train it further."""
-    steps = min(standing.env_steps for standing in standings)
-    planned = config.ppo.training_steps * config.ppo.steps_per_training_step
-    setting = "ppo.num_timesteps"
-    if steps < planned:
-        setting = "stop_at_success" if config.stop_at_return is None else "stop_at_return"
-    return f"complete after {steps:,} steps; raise {setting} to train further"
-
-
 def _headline(training: Training) -> str:
     config, device = training.config, jax.devices()[0]
     hosts = f" of {jax.process_count()} processes" if jax.process_count() > 1 else ""
@@ -556,58 +381,3 @@ def _headline(training: Training) -> str:
         f" {jax.device_count()} x {device.device_kind}{hosts}\nrun folder: {training.run_dir}"
         f"{hints}"
     )
-
-
-def told_score(best: Summary | ReturnSummary) -> str:
-    """Return in words the number by which the best checkpoint was found."""
-    if best.success_rate is None:
-        return f"return {best.episode_return:.1f}"
-    return f"{best.success_rate:.1%} success"
-
-
-def stop_message(run: Training | Result) -> str:
-    """Return the line about a training that was stopped."""
-    if not all(map(checkpoint_steps, run.run_dirs)):
-        return "stopped before the first checkpoint: the same command starts from the beginning"
-    return f"stopped; to resume: jetbot-mjx train --resume {shlex.quote(str(run.run_dir))}"
-
-
-def closing_message(result: Result) -> str:
-    """Return the text that a training prints at last."""
-    return summary(result) if result.finished else stop_message(result)
-
-
-def summary(result: Result) -> str:
-    """Return the text that is printed at the end of a training."""
-    lines = []
-    for standing, folder, fingerprint in zip(
-        result.standings, result.run_dirs, result.fingerprints, strict=True
-    ):
-        assert standing.best is not None
-        seed = f"{folder.name}, " if folder != result.run_dir else ""
-        lines.append(
-            f"{seed}best policy: {told_score(standing.best)} at"
-            f" {standing.best_steps:,} steps; last parameters: sha256 {fingerprint}"
-        )
-    if len(lines) > 1:
-        # Its statistics take half a second to import.
-        from jetbot_mjx.evaluation import bootstrap
-
-        best = [standing.best for standing in result.standings if standing.best]
-        form = "{:.2%}" if best[0].success_rate is not None else "{:.1f}"
-        over_seeds = bootstrap(np.mean, [one.score for one in best])
-        value, low, high = map(form.format, (over_seeds.value, over_seeds.low, over_seeds.high))
-        what = "success" if best[0].success_rate is not None else "return"
-        lines.append(
-            f"{len(lines)} seeds: {value} {what} in the mean (95 % interval {low} .. {high})"
-        )
-    first = shlex.quote(str(result.run_dirs[0]))
-    lines += [
-        f"total {result.wall_seconds:.1f} s",
-        f"next: jetbot-mjx {result.next_commands[0]} {shlex.quote(str(result.run_dir))}",
-        *(f"      jetbot-mjx {command} {first}" for command in result.next_commands[1:]),
-    ]
-    if importlib.util.find_spec("tensorboard") is not None:
-        # TensorBoard names runs by their folder below this one.
-        lines.append(f"      tensorboard --logdir {shlex.quote(str(result.run_dir.parent))}")
-    return "\n".join(lines)

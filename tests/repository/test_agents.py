@@ -14,7 +14,7 @@ from jetbot_mjx import __main__ as overview
 from jetbot_mjx.config import shipped_folder
 from jetbot_mjx.evaluation import Report
 from jetbot_mjx.evaluation.evaluator import Summary
-from jetbot_mjx.training.session import Result
+from jetbot_mjx.training.result import Result
 from jetbot_mjx.tuning import TuningResult
 from jetbot_mjx.viewers.gallery import Rendered
 

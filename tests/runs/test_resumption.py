@@ -44,6 +44,8 @@ from jetbot_mjx.runs.resumption import TRAINING, resume, to_trees
 from jetbot_mjx.runs.run_dir import write_run
 from jetbot_mjx.training import ppo_trainer, session
 from jetbot_mjx.training.preemption import StopRequest
+from jetbot_mjx.training.result import complete_message
+from jetbot_mjx.training.run_recorder import Standing
 from onekernel.aot.program_cache import ProgramCache
 
 STEPS = [0, 16_384, 32_768, 49_152, 65_536]
@@ -723,7 +725,7 @@ def test_resuming_a_complete_run_says_how_to_train_longer(run_copy, config, caps
     out = capsys.readouterr().out
     assert f"complete after {LAST:,} steps; raise ppo.num_timesteps to train further\n" in out
     assert not any(line.startswith("resuming") for line in out.splitlines())
-    early = session._complete_message(config, [session.Standing(env_steps=16_384)])
+    early = complete_message(config, [Standing(env_steps=16_384)])
     assert early == "complete after 16,384 steps; raise stop_at_success to train further"
 
 

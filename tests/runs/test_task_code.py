@@ -20,7 +20,7 @@ from jetbot_mjx.runs.task_code import (
     read_task_code,
     write_task_code,
 )
-from jetbot_mjx.training import session
+from jetbot_mjx.training import composition, session
 
 NAME = "kicking_task"
 
@@ -320,18 +320,18 @@ def test_a_run_is_whole_without_the_module_and_resumes_with_its_own_task(
     assert load_checkpoint(run_dir).make_env().task.factor == 3
     monkeypatch.setattr(task_code, "_said", set())
     capsys.readouterr()
-    task_class, code = session._find_code(config, [run_dir])
+    task_class, code = composition.find_code(config, [run_dir])
     assert (task_class.factor, code) == (3, None)
     assert f"{NAME} on disk differs from the code this run was" in capsys.readouterr().err
     # A new run has the new one, in the folders of all of its seeds.
     two = parse_config({**config.model_dump(), "seeds": 2})
     run_dirs = [tmp_path / "two" / f"seed-{n}" for n in (0, 1)]
-    task_class, code = session._find_code(config, run_dirs)
+    task_class, code = composition.find_code(config, run_dirs)
     assert task_class is None
     assert dict(code.files)["kicking_tools.py"] == TOOLS.format(4).encode()
     for folder in run_dirs:
         folder.mkdir(parents=True)
     folders = {"run_dir": tmp_path / "two", "run_dirs": run_dirs}
-    session._store_run(session.Training(setup=Setup(two), **folders, ppo=None, task_code=code))
+    session._store_run(composition.Training(setup=Setup(two), **folders, ppo=None, task_code=code))
     for folder in (tmp_path / "two", *run_dirs):
         assert read_task_code(folder) == code

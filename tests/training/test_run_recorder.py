@@ -18,7 +18,7 @@ from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps, read_about
 from jetbot_mjx.runs.metrics import CompileClock
-from jetbot_mjx.training import run_recorder, session
+from jetbot_mjx.training import composition, run_recorder, session
 from jetbot_mjx.training.callbacks import Progress
 from jetbot_mjx.training.ppo_trainer import build_ppo
 from jetbot_mjx.viewers import video
@@ -65,7 +65,7 @@ def recorder(root, tmp_path, monkeypatch):
         clocks.append(CompileClock())
         setup = Setup(config)
         ppo = build_ppo(setup)
-        parts = session.Training(setup=setup, run_dir=tmp_path, run_dirs=folders, ppo=ppo)
+        parts = composition.Training(setup=setup, run_dir=tmp_path, run_dirs=folders, ppo=ppo)
         return session.open_recorder(parts, clocks[-1], None)
 
     yield recorder
