@@ -4,7 +4,9 @@
   the refusals from its checks, and the values of the shipped files from the files.
 - Tables in pages that hold `<!-- table: NAME -->`: those of quantities that may differ come from
   `QUANTITIES` and the shipped files, that of JAX's primitives from `onekernel`.
-- `api/ROOM.md`: The public names and the modules of each room come from its folder.
+- `api/ROOM/...`: The public names and the modules of each room come from its folder; the
+  navigation has them below the page of public names.
+- `contributing.md`: `CONTRIBUTING.md` of the repository.
 - Each page as Markdown beside its HTML, where the links of `llms.txt` lead.
 
 Nothing of this is written by hand.
@@ -45,6 +47,9 @@ from onekernel.lower.jaxpr import primitives
 
 ROOT = Path(__file__).parents[1]
 PAGE = "configuration.md"
+CONTRIBUTING = "contributing.md"
+API = "api/index.md"
+"""The page below which the navigation has the generated reference."""
 
 _INTRODUCTION = """\
 # Configuration reference
@@ -365,46 +370,165 @@ def page() -> str:
     return "\n".join(lines)
 
 
-def room_pages() -> dict[str, str]:
-    """Return the reference of the compiler, the root and each room, by the name of its page."""
+def generated() -> dict[str, str]:
+    """Return the generated pages by their paths, without the reference of the rooms."""
+    return {PAGE: page(), CONTRIBUTING: contributing()}
+
+
+def contributing() -> str:
+    """Return `CONTRIBUTING.md` with links as they are from a page of the site."""
+    return (ROOT / "CONTRIBUTING.md").read_text("utf-8").replace("](docs/", "](")
+
+
+class Room(NamedTuple):
+    """A `Room` holds the reference of a package, of which each part is a page."""
+
+    name: str
+    face: Path
+    """Its `__init__.py`."""
+    parts: Mapping[str, list[str]]
+    """Names of modules by the page that they are on: a page for each module with public names, for
+    the others in a folder, and for the rest."""
+
+    @property
+    def home(self) -> str:
+        """Return the name of the package."""
+        return ".".join(self.face.parent.relative_to(ROOT).parts)
+
+    @property
+    def pages(self) -> dict[str, str]:
+        """Return the Markdown of each page by its path, that of the package first."""
+        pages = {f"api/{self.name}/index.md": _room_page(self)}
+        for part, modules in self.parts.items():
+            pages[f"api/{self.name}/{part}.md"] = _part_page(self, part, modules)
+        return pages
+
+    @property
+    def nav(self) -> list[Any]:
+        """Return the entries of the navigation."""
+        return [
+            f"api/{self.name}/index.md",
+            *({part: f"api/{self.name}/{part}.md"} for part in self.parts),
+        ]
+
+    def public(self, module: str) -> list[str]:
+        """Return the names that the package exports of a module."""
+        inside = re.escape(module.removeprefix(f"{self.home}."))
+        stub = self.face.with_suffix(".pyi").read_text("utf-8")
+        return sorted(re.findall(rf"^from \.{inside} import (\w+)", stub, re.M))
+
+
+_REST = "inside"
+"""The page of the modules without public names."""
+
+
+def rooms() -> list[Room]:
+    """Return the root of the package, its rooms in the order of their names, and the engine."""
     package = ROOT / "jetbot_mjx"
-    pages = {
-        f"api/{face.parent.name}.md": _package_page(f"`{face.parent.name}`", face)
-        for face in sorted(package.glob("*/__init__.py"))
-    }
-    return {
-        **pages,
-        "api/root.md": _package_page("Commands", package / "__init__.py", inside="*.py"),
-        "api/onekernel.md": _package_page("`onekernel`", ROOT / "onekernel" / "__init__.py"),
-    }
+    return [
+        _room("root", package / "__init__.py", inside="*.py"),
+        _room("onekernel", ROOT / "onekernel" / "__init__.py"),
+        *(_room(face.parent.name, face) for face in sorted(package.glob("*/__init__.py"))),
+    ]
 
 
-def _package_page(title: str, face: Path, inside: str = "**/*.py") -> str:
-    """Return the reference of a package.
+def room_pages() -> dict[str, str]:
+    """Return the reference of all rooms, by the paths of its pages."""
+    return {path: text for room in rooms() for path, text in room.pages.items()}
+
+
+def _room(name: str, face: Path, inside: str = "**/*.py") -> Room:
+    """Return a package with its modules divided into pages.
 
     Args:
-      title: the heading.
+      name: its name on the site.
       face: its `__init__.py`.
-      inside: which of the modules inside the page has.
+      inside: which of the modules inside belong to it.
     """
-    home = ".".join(face.parent.relative_to(ROOT).parts)
-    first, _, rest = (ast.get_docstring(ast.parse(face.read_text("utf-8"))) or "").partition("\n\n")
-    modules = []
+    room = Room(name, face, {})
+    parts: dict[str, list[str]] = {}
     for path in sorted(face.parent.glob(inside)):
-        if path != face:
-            parts = path.relative_to(ROOT).with_suffix("").parts
-            modules.append(f"::: {'.'.join(parts).removesuffix('.__init__')}\n")
-    names = sorted(importlib.import_module(home).__all__)
-    imported = "".join(f"    {name},\n" for name in names)
-    block = f"```python\nfrom {home} import (\n{imported})\n```\n" if names else ""
-    return "\n".join([f"# {title}\n", f"{first}\n", block, f"{rest}\n", *modules])
+        inner = path.relative_to(face.parent).with_suffix("").parts
+        if path == face:
+            continue
+        module = f"{room.home}.{'.'.join(inner)}".removesuffix(".__init__")
+        if room.public(module):
+            part = ".".join(inner).removesuffix(".__init__")
+        else:
+            part = inner[0] if len(inner) > 1 else _REST
+        parts.setdefault(part, []).append(module)
+    order = sorted(parts, key=lambda part: (part == _REST, part))
+    return room._replace(parts={part: parts[part] for part in order})
+
+
+def _docstring(module: str) -> tuple[str, str]:
+    """Return the first sentence of a module's docstring, and the rest."""
+    path = ROOT / module.replace(".", "/")
+    path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    first, _, rest = (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "").partition("\n\n")
+    return " ".join(first.split()), rest
+
+
+def _imported(home: str, names: Sequence[str]) -> str:
+    lines = "".join(f"    {name},\n" for name in names)
+    return f"```python\nfrom {home} import (\n{lines})\n```\n" if names else ""
+
+
+def _room_page(room: Room) -> str:
+    """Return the page of a room: its purpose, what it exports, and its other pages."""
+    first, rest = _docstring(room.home)
+    names = sorted(importlib.import_module(room.home).__all__)
+    lines = [f"# `{room.home}`\n", f"{first}\n", "| page | what it has |", "|---|---|"]
+    for part, modules in room.parts.items():
+        public = [f"`{name}`" for module in modules for name in room.public(module)]
+        text = f"{_docstring(modules[0])[0]} {', '.join(public)}"
+        if part == _REST:
+            inside = (f"`{module.removeprefix(f'{room.home}.')}`" for module in modules)
+            text = f"Modules without public names: {', '.join(inside)}"
+        cell = text.strip().replace("|", "\\|")
+        lines.append(f"| [{part}]({part}.md) | {cell} |")
+    return "\n".join([*lines, "", f"{rest}\n", _imported(room.home, names)])
+
+
+def _part_page(room: Room, part: str, modules: Sequence[str]) -> str:
+    """Return a page of the reference, with one module or several."""
+    title = f"Inside `{room.home}`" if part == _REST else f"`{room.home}.{part}`"
+    names = sorted({name for module in modules for name in room.public(module)})
+    # The title is that of the module.
+    alone = "    options:\n      show_root_heading: false\n"
+    told = f"::: {modules[0]}\n{alone}" if len(modules) == 1 and part != _REST else None
+    texts = [told] if told else [f"::: {module}\n" for module in modules]
+    return "\n".join([f"# {title}\n", _imported(room.home, names), *texts])
+
+
+def with_reference(nav: list[Any]) -> list[Any]:
+    """Return the entries of the navigation, with the rooms beside the page of public names."""
+    added = [{room.name: room.nav} for room in rooms()]
+    return [
+        {title: [*pages, *added] if API in map(_only, pages) else pages}
+        if isinstance(pages, list)
+        else {title: pages}
+        for entry in nav
+        for title, pages in entry.items()
+    ]
+
+
+def _only(entry: Any) -> Any:
+    """Return the page of an entry of the navigation, or the entry itself."""
+    return next(iter(entry.values())) if isinstance(entry, dict) else entry
+
+
+def on_config(config: Any) -> Any:
+    """Add the generated reference to the navigation; MkDocs calls this."""
+    config["nav"] = with_reference(config["nav"])
+    return config
 
 
 def on_files(files: Any, *, config: Any) -> Any:
     """Add the generated pages to the files of the site; MkDocs calls this."""
     from mkdocs.structure.files import File
 
-    for name, text in {PAGE: page(), **room_pages()}.items():
+    for name, text in {**generated(), **room_pages()}.items():
         files.append(File.generated(config, name, content=text))
     return files
 
@@ -420,7 +544,8 @@ def on_post_build(*, config: Any) -> None:
     for path in docs.rglob("*.md"):
         text = with_tables(path.read_text("utf-8"))
         (site / path.relative_to(docs)).write_text(text, encoding="utf-8")
-    (site / PAGE).write_text(page(), encoding="utf-8")
+    for name, text in generated().items():
+        (site / name).write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

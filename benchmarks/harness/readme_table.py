@@ -259,6 +259,7 @@ def _table(head: Sequence[str], alignment: str, rows: Sequence[Sequence[str]]) -
 
 BLOCKS: Mapping[str, Mapping[str, Callable[[Results], str]]] = {
     "README.md": {"summary": summary_table},
+    "docs/index.md": {"summary": summary_table},
     "docs/results.md": {"success": success_table, "rates": best_rates_table},
     "benchmarks/README.md": {"results": rates_tables},
     "docs/from-the-tutorial.md": {"adapters": adapters_table},

@@ -48,7 +48,10 @@ PAGES = {
     for path in DOCS.rglob("*.md")
 }
 
-ALL_PAGES = {**PAGES, GENERATED: reference.page(), **reference.room_pages()}
+REFERENCE = reference.room_pages()
+"""The pages of the rooms, which the build writes."""
+
+ALL_PAGES = {**PAGES, **reference.generated(), **REFERENCE}
 
 
 def blocks(text, language):

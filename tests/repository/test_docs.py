@@ -23,12 +23,14 @@ from helpers.doc_pages import (
     DOCS,
     GENERATED,
     PAGES,
+    REFERENCE,
     ROOT,
     blocks,
     commands,
     in_full,
     load,
     own_files,
+    reference,
 )
 from jetbot_mjx import (
     cli,
@@ -53,34 +55,78 @@ from jetbot_mjx.runs.sb3_tags import aliases
 from onekernel import fuse, gpu
 from onekernel.gpu.kernel_text import kernel_text
 
+NAV = YAML(typ="safe").load(ROOT / "mkdocs.yml")["nav"]
 
-def nav():
-    def pages(entry):
-        match entry:
-            case str():
-                yield entry
-            case dict():
-                for value in entry.values():
-                    yield from pages(value)
-            case list():
-                for value in entry:
-                    yield from pages(value)
 
-    return list(pages(YAML(typ="safe").load(ROOT / "mkdocs.yml")["nav"]))
+def pages_of(entry):
+    """Pages of an entry of the navigation."""
+    match entry:
+        case str():
+            yield entry
+        case dict():
+            for value in entry.values():
+                yield from pages_of(value)
+        case list():
+            for value in entry:
+                yield from pages_of(value)
 
 
 # Pages and links.
 
 
 def test_every_page_is_in_the_navigation():
-    assert sorted(nav()) == sorted(ALL_PAGES)
+    assert sorted(pages_of(reference.with_reference(NAV))) == sorted(ALL_PAGES)
 
 
 def test_every_page_is_linked_from_the_first():
-    """From the overview, and the reference of each room from the page of public names."""
-    linked = {page: set(re.findall(r"\]\(([^)#]+\.md)", PAGES[page])) for page in PAGES}
-    rooms = {f"api/{page}" for page in linked["api/index.md"]}
-    assert linked["index.md"] | rooms | {"index.md"} >= set(ALL_PAGES)
+    """From the overview; the rooms from the page of public names, and their parts from them."""
+
+    def linked(page):
+        found = re.findall(r"\]\(([^)#]+\.md)", ALL_PAGES[page])
+        return {os.path.normpath(Path(page).parent / target) for target in found}
+
+    assert linked("index.md") | {"index.md"} >= ALL_PAGES.keys() - REFERENCE.keys()
+    rooms = linked("api/index.md") & REFERENCE.keys()
+    assert rooms == {page for page in REFERENCE if page.endswith("/index.md")}
+    assert rooms.union(*map(linked, rooms)) >= REFERENCE.keys()
+
+
+def groups():
+    """Titles and pages by the groups of the navigation."""
+    return {
+        group: [(title, page) for entry in pages for title, page in entry.items()]
+        for entry in NAV
+        for group, pages in entry.items()
+        if isinstance(pages, list)
+    }
+
+
+def test_the_first_page_has_the_groups_of_the_navigation():
+    found = {}
+    for line in PAGES["index.md"].splitlines():
+        if group := re.match(r"\| \*\*(.+)\*\* \|", line):
+            found[group[1]] = []
+        elif row := re.match(r"\| .+? \| \[(.+?)\]\((\S+?)\)", line):
+            found[next(reversed(found))].append((row[1], row[2]))
+    assert found == groups()
+
+
+def test_the_index_for_assistants_has_the_groups_of_the_navigation():
+    text = (DOCS / "llms.txt").read_text("utf-8")
+    found = {
+        section.partition("\n")[0]: re.findall(r"^- \[(.+?)\]\((\S+?)\)", section, re.M)
+        for section in text.split("\n## ")[1:]
+    }
+    found["Start"].remove(("Overview", "index.md"))
+    assert found == groups()
+
+
+def test_a_page_of_the_reference_is_short():
+    """None has more than a class or a family of functions, so that it can be read as one."""
+    public = {page: text.partition("\n:::")[0] for page, text in REFERENCE.items()}
+    for page, text in public.items():
+        if not page.endswith(("/index.md", "/inside.md")):
+            assert text.count("\n    ") <= 25, page
 
 
 def test_every_module_has_its_place_in_the_reference():
@@ -168,14 +214,20 @@ def site(tmp_path_factory):
 def test_the_site_builds_without_a_warning(site):
     assert all((site / page.replace(".md", ".html")).is_file() for page in ALL_PAGES)
     assert not list(site.rglob("*.py"))
-    html = (site / "api/envs.html").read_text("utf-8")
+    html = (site / "api/envs/jetbot_env.html").read_text("utf-8")
     assert 'id="jetbot_mjx.envs.jetbot_env.JetBotEnv.step"' in html
     # What docstrings.py mends.
-    assert "Yaw in (-π, π] [rad]" in html
-    assert "seed-&lt;n&gt;" in (site / "api/runs.html").read_text("utf-8")
-    assert "<code>eval/episodes  " in re.sub(
-        r"<pre><span></span>", "", (site / "api/runs.html").read_text("utf-8")
-    )
+    yaw = (site / "api/envs/kinematics.html").read_text("utf-8")
+    assert "Yaw in (-π, π] [rad]" in yaw
+    assert "seed-&lt;n&gt;" in (site / "api/runs/run_dir.html").read_text("utf-8")
+    told = (site / "api/runs/metrics.html").read_text("utf-8")
+    assert "<code>eval/episodes  " in told.replace("<pre><span></span>", "")
+
+
+def test_the_site_has_its_pages_as_markdown_too(site):
+    assert (site / "llms.txt").read_text("utf-8") == (DOCS / "llms.txt").read_text("utf-8")
+    for page in ALL_PAGES.keys() - REFERENCE.keys():
+        assert (site / page).read_text("utf-8") == ALL_PAGES[page]
 
 
 def test_the_site_loads_nothing_from_elsewhere(site):

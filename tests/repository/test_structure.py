@@ -229,7 +229,7 @@ def test_the_package_tells_its_rooms_in_their_order():
 def test_the_design_page_counts_the_rooms():
     design = (ROOT / "docs" / "design.md").read_text("utf-8")
     assert f"is {len(ROOMS)} rooms (folders)" in design
-    table = re.findall(r"^\| \[`(\w+)`\]\(api/\w+\.md\)", design, re.MULTILINE)
+    table = re.findall(r"^\| \[`(\w+)`\]\(api/\w+/index\.md\)", design, re.MULTILINE)
     assert table == [ENGINE, *ROOMS]
 
 
