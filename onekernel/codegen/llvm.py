@@ -20,16 +20,14 @@ Source: LLVM Language Reference Manual.
 
 import functools
 import hashlib
-import math
-import operator
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from onekernel.codegen.writer import LlvmWriter, Value, llvm_type, vector
+from onekernel.codegen.instructions import ELEMENTS, Target, write_of
+from onekernel.codegen.writer import LlvmWriter, Value, llvm_type
 from onekernel.errors import UnsupportedError
 from onekernel.lower import (
-    COMPARISONS,
     Block,
     Expr,
     Item,
@@ -46,13 +44,6 @@ from onekernel.lower import (
 
 STEP = "step"
 """Name of the function that runs one step, or all items."""
-
-_ELEMENTS = {"f": "float", "i": "i32", "u": "u32", "b": "i1"}
-"""Type of a scalar by the kind of its dtype."""
-
-_EXTREMES = {"max": "maximum", "min": "minimum"}
-_APPROXIMATIONS = {"exp": "ex2", "log": "lg2", "reciprocal": "rcp"}
-_INTRINSICS = {"abs": "fabs", "floor": "floor", "round": "roundeven", "sqrt": "sqrt"}
 
 
 def run_program(
@@ -186,7 +177,7 @@ def require(program: ScalarProgram) -> None:
     _inputs(program)
     for value in program.block.values():
         if value.op not in ("array", "load"):
-            _write_of(value)
+            write_of(value)
 
 
 def _inputs(program: ScalarProgram) -> list[Expr]:
@@ -225,8 +216,8 @@ class ProgramWriter:
           UnsupportedError: an argument is not float32.
         """
         self._inputs = _inputs(program)
-        self.writer, self.for_gpu = writer, for_gpu
-        self.flags = "afn" if approximate else ""
+        self._writer = writer
+        self._on = Target(writer, "afn" if approximate else "", for_gpu)
         self._program = program
         self._rest: list[Item] = program.block.items
         self._values: dict[int, Value | Callable[[], Value]] = {}
@@ -277,10 +268,6 @@ class ProgramWriter:
         self._block(Block(items=list(self._rest)))
         return (self._operand(x) for array in self._program.outputs for x in array.ravel())
 
-    def type(self, kind: str) -> str:
-        """Return the type of a value by the kind of its dtype."""
-        return vector(_ELEMENTS[kind], self.writer.lanes)
-
     def _operand(self, x: Scalar) -> Value:
         if not is_constant(x):
             if self._is_deferred(x):
@@ -288,19 +275,19 @@ class ProgramWriter:
             if x.index in self._recomputed:
                 return self._computed_again(x)
             if x.op == "counter":
-                return self._counters[x.index].splat(self.writer.lanes)
+                return self._counters[x.index].splat(self._writer.lanes)
             value = self._values[x.index]
             return value if isinstance(value, Value) else value()
         if x.dtype.kind == "f" and np.isnan(x):
             # The bits of an integer that is passed as a float may be those of a NaN. LLVM's text of
             # a NaN would not keep all of them: write the integer, and reinterpret it.
-            whole = self.writer.constant(int(x.view(np.int32)), self.type("i"))
-            return whole.bits_as(self.type("f"))
-        return self.writer.constant(x.item(), self.type(x.dtype.kind))
+            whole = self._writer.constant(int(x.view(np.int32)), self._on.type("i"))
+            return whole.bits_as(self._on.type("f"))
+        return self._writer.constant(x.item(), self._on.type(x.dtype.kind))
 
     def _any(self, condition: Value) -> Value:
         """Return whether a condition holds in any lane."""
-        w = self.writer
+        w = self._writer
         if w.lanes == 1:
             return condition
         return w.call(f"llvm.vector.reduce.or.v{w.lanes}i1", condition, result="i1")
@@ -312,7 +299,7 @@ class ProgramWriter:
             if isinstance(item, PlacedLoop):
                 enclosing = self._recomputed
                 # A CPU reads a value from memory as cheaply as it computes it again.
-                self._recomputed |= recomputable(item) if self.for_gpu else frozenset()
+                self._recomputed |= recomputable(item) if self._on.for_gpu else frozenset()
                 write = self._loop if item.loop.counter is None else self._counted_loop
                 write(item)
                 self._recomputed = enclosing
@@ -325,12 +312,12 @@ class ProgramWriter:
         """Append a block that only some of the active lanes execute."""
         enclosing = self._mask
         # With a single lane, the block is run for that lane or skipped, so no mask is needed.
-        self._mask = mask if self.writer.lanes > 1 else None
+        self._mask = mask if self._writer.lanes > 1 else None
         self._block(block)
         self._mask = enclosing
 
     def _counted_loop(self, item: PlacedLoop) -> None:
-        w, loop = self.writer, item.loop
+        w, loop = self._writer, item.loop
         counter, length = loop.counter, loop.length
         assert counter is not None
         assert length is not None
@@ -369,10 +356,10 @@ class ProgramWriter:
     def _loop(self, item: PlacedLoop) -> None:
         # The loop has two blocks of code: `head` computes the condition, and `body` an iteration.
         # Begin the head with one phi for each carry, and one for the lanes that are still active.
-        w, loop = self.writer, item.loop
+        w, loop = self._writer, item.loop
         carries = [loop.carries[place] for place in item.places]
         initial = [self._operand(loop.initial[place]) for place in item.places]
-        initial.append(w.constant(True, self.type("b")) if self._mask is None else self._mask)
+        initial.append(w.constant(True, self._on.type("b")) if self._mask is None else self._mask)
         head, body, end = w.labels("head", "body", "end")
         before = w.label
         w.jump(head)
@@ -439,10 +426,10 @@ class ProgramWriter:
         Returns:
           The values after the branch.
         """
-        w = self.writer
+        w = self._writer
         # Lanes that do not execute the enclosing block take no side.
         taking = condition if self._mask is None else condition & self._mask
-        absent = [Value(w, "zeroinitializer", self.type(x.dtype.kind)) for x in scalars]
+        absent = [Value(w, "zeroinitializer", self._on.type(x.dtype.kind)) for x in scalars]
         if others is not None:
             absent = [x if isinstance(x, Value) else self._operand(x) for x in others]
         # Jump over the side if no lane takes it; behind it, both ways meet.
@@ -469,11 +456,11 @@ class ProgramWriter:
 
     def _allocated(self, array: Expr) -> Value:
         """Return the address of memory for the scalars of an array."""
-        lanes = self.writer.lanes
-        return self.writer.allocate(length_of(array), self.type(array.dtype.kind), align=4 * lanes)
+        w = self._writer
+        return w.allocate(length_of(array), self._on.type(array.dtype.kind), align=4 * w.lanes)
 
     def _store(self, array: Value, place: Value | int, value: Value) -> None:
-        array.at(place, value.type).store(value, align=4 * self.writer.lanes)
+        array.at(place, value.type).store(value, align=4 * self._writer.lanes)
 
     def _array(self, array: Expr) -> Value:
         """Append an array of given scalars, and return its address."""
@@ -481,7 +468,7 @@ class ProgramWriter:
             return self._table(array)
         address = self._allocated(array)
         for i, x in enumerate(array.operands):
-            self.writer.divide(i)
+            self._writer.divide(i)
             self._store(address, i, self._operand(x))
         return address
 
@@ -494,19 +481,19 @@ class ProgramWriter:
         name = f"@table_{hashlib.sha256(numbers.tobytes()).hexdigest()[:16]}"
         words = ", ".join(f"i32 {number}" for number in numbers)
         # On a GPU, it is in address space 1, as the arrays of XLA.
-        space = " addrspace(1)" if self.for_gpu else ""
-        self.writer.declare(
+        space = " addrspace(1)" if self._on.for_gpu else ""
+        self._writer.declare(
             f"{name} = internal{space} constant [{len(numbers)} x i32] [{words}], align 4"
         )
-        return Value(self.writer, name, f"ptr{space}")
+        return Value(self._writer, name, f"ptr{space}")
 
     def _load(self, value: Expr) -> Value:
         """Append a load of a scalar of an array."""
-        w = self.writer
+        w = self._writer
         array, index = value.operands
         assert isinstance(array, Expr)
         address, is_one = self._addresses[array.index], is_table(array)
-        element, vectors = _ELEMENTS[value.dtype.kind], self.type(value.dtype.kind)
+        element, vectors = ELEMENTS[value.dtype.kind], self._on.type(value.dtype.kind)
         # A constant or a counter is the same in all lanes: load the vector of all of them, or the
         # one number of a table.
         if is_constant(index) or index.op == "counter":
@@ -552,22 +539,22 @@ class ProgramWriter:
 
     def _computed_again(self, value: Expr) -> Value:
         """Append an operation from before a loop once more, in the present basic block."""
-        key = value.index, self.writer.label
+        key = value.index, self._writer.label
         if key not in self._again:
             operands = [self._operand(x) for x in value.operands]
             place = next(i for i, x in enumerate(value.operands) if not is_constant(x))
             # LLVM would find the equal operation before the loop, and take its value: pass an
             # operand through an instruction that LLVM does not know.
             operand = operands[place]
-            operands[place] = self.writer.let(
+            operands[place] = self._writer.let(
                 f'call float asm sideeffect "mov.f32 $0, $1;", "=f,f"({operand.typed})', "float"
             )
-            self._again[key] = _write_of(value, for_gpu=True)(self, value, operands)
+            self._again[key] = write_of(value, for_gpu=True)(self._on, value, operands)
         return self._again[key]
 
     def _computed(self, value: Expr) -> Value:
-        write = _write_of(value, for_gpu=self.for_gpu)
-        return write(self, value, [self._operand(x) for x in value.operands])
+        write = write_of(value, for_gpu=self._on.for_gpu)
+        return write(self._on, value, [self._operand(x) for x in value.operands])
 
 
 def _source(x: Scalar) -> Scalar:
@@ -578,186 +565,3 @@ def _source(x: Scalar) -> Scalar:
             break
         x = x.operands[0]
     return x
-
-
-# Operations: each function appends those of one scalar of a program, and returns it.
-
-_Write = Callable[[ProgramWriter, Expr, list[Value]], Value]
-
-
-def _plain(apply: Callable[..., Value]) -> _Write:
-    """Write an operation that is an operator of `Value`."""
-    return lambda on, value, operands: apply(*operands)
-
-
-def _intrinsic(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    return on.writer.intrinsic(_INTRINSICS[value.op], *operands, flags=on.flags)
-
-
-def _approximation(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    (x,) = operands
-    # The instructions are 2^x and log₂ x: exp(x) is 2^(x / ln 2), and log(x) is log₂(x) · ln 2.
-    # LLVM has no function for them that is compiled to one instruction, so write it as assembly:
-    # `$0` is the result and `$1` the operand, both in registers of floats ("=f,f").
-    x = x * (1 / math.log(2)) if value.op == "exp" else x
-    instruction = f"{_APPROXIMATIONS[value.op]}.approx.ftz.f32"
-    result = on.writer.let(f'call float asm "{instruction} $0, $1;", "=f,f"({x.typed})', x.type)
-    return result * math.log(2) if value.op == "log" else result
-
-
-def _quotient(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    x, y = operands
-    if not on.flags:
-        return x / y
-    # `afn` allows an approximate division, for which the plain operator has no flag.
-    return on.writer.let(f"fdiv {on.flags} contract {x.typed}, {y.text}", x.type)
-
-
-def _extreme(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    w = on.writer
-    if on.for_gpu:
-        # `llvm.maximum` returns NaN if either operand is NaN, as JAX does. GPUs compute it in one
-        # instruction, CPUs do not.
-        return w.intrinsic(_EXTREMES[value.op], *operands)
-    # A comparison and a selection are one instruction on x86, which returns the second operand if
-    # either is NaN. So NaN in the second operand is kept, and NaN in the first one is selected. A
-    # constant is no NaN (the graph has simplified that): put it first, and save that selection.
-    ordered = sorted(
-        zip(value.operands, operands, strict=True), key=lambda x: not is_constant(x[0])
-    )
-    (first, a), (_, b) = ordered
-    best = _larger(on, value, [a, b])
-    return best if is_constant(first) else w.select(a.differs(a), a, best)
-
-
-def _larger(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    choose = on.writer.maximum if value.op == "max" else on.writer.minimum
-    return choose(*operands)
-
-
-def _finite(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    # Neither infinity nor NaN is less than infinity.
-    return on.writer.intrinsic("fabs", *operands) < math.inf
-
-
-def _magnitude(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    (x,) = operands
-    return on.writer.select(x < 0, -x, x)
-
-
-def _word_sum(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    a, b = operands
-    if not on.for_gpu:
-        return a + b
-    # LLVM's instruction selection for GPUs takes time quadratic in the number of sums with one of
-    # the operands, and 13 s for a hundred random numbers from one key.
-    return on.writer.let(
-        f'call i32 asm "add.u32 $0, $1, $2;", "=r,r,r"({a.typed}, {b.typed})', a.type
-    )
-
-
-def _rotation(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    x, by = operands
-    # A funnel shift of a number with itself is a rotation.
-    return on.writer.intrinsic("fshl", x, x, by)
-
-
-def _angle(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    """Write `quarter_turns` or `angle_rest` of an angle (see `EVALUATE`), computed in `double`."""
-    w = on.writer
-    angle = operands[0].to("double")
-
-    def constant(x: float) -> Value:
-        return w.constant(x, angle.type)
-
-    turns = w.intrinsic("roundeven", angle * (2 / math.pi))
-    if value.op == "quarter_turns":
-        whole = w.intrinsic("floor", turns * 0.25)
-        return w.intrinsic("fma", whole, constant(-4.0), turns).to("float")
-    # π/2 in two parts; each product is exact in a fused multiply-add.
-    result = angle
-    for part in _HALF_PI:
-        result = w.intrinsic("fma", turns, constant(-part), result)
-    return result.to("float")
-
-
-def _logical_shift(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    """Shift to the right, and fill up with zeros: so an integer without a sign is shifted."""
-    x, by = (operand.to("u32") for operand in operands)
-    return (x >> by).to(_ELEMENTS[value.dtype.kind])
-
-
-def _select(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    condition, if_false, if_true = operands
-    return on.writer.select(condition, if_true, if_false)
-
-
-def _convert(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    (x,), to = operands, value.dtype.kind
-    if value.operands[0].dtype.kind != "f":
-        return x.to(_ELEMENTS[to])
-    # Saturating conversions: numbers beyond the range become its ends and NaN becomes 0, as in JAX,
-    # where the plain instruction would be undefined.
-    name = "fptoui.sat" if to == "u" else "fptosi.sat"
-    return on.writer.intrinsic(name, x, result=on.type(to))
-
-
-def _bitcast(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    return operands[0].bits_as(on.type(value.dtype.kind))
-
-
-_HALF_PI = (math.pi / 2, 6.123233995736766e-17)
-"""π/2 as a sum of two numbers of 64 bits."""
-
-_COMPARE = {
-    **{name: getattr(operator, name) for name in ("lt", "le", "gt", "ge")},
-    "eq": Value.equals,
-    "ne": Value.differs,
-}
-
-_OPERATIONS: dict[tuple[str, str], _Write] = {
-    **{(op, kind): _plain(getattr(operator, op)) for op in ("mul", "sub") for kind in "fiu"},
-    **{("add", kind): _plain(operator.add) for kind in "fi"},
-    ("add", "u"): _word_sum,
-    **{("and", kind): _plain(operator.and_) for kind in "iub"},
-    **{("or", kind): _plain(operator.or_) for kind in "iub"},
-    **{("xor", kind): _plain(operator.xor) for kind in "iub"},
-    **{(op, kind): _plain(_COMPARE[op]) for op in COMPARISONS for kind in "fiu"},
-    **{(op, "b"): _plain(_COMPARE[op]) for op in ("eq", "ne")},
-    **{(op, "f"): _approximation for op in _APPROXIMATIONS},
-    **{(op, "f"): _intrinsic for op in _INTRINSICS},
-    **{(op, "f"): _extreme for op in _EXTREMES},
-    **{(op, kind): _larger for op in _EXTREMES for kind in "iu"},
-    **{("select", kind): _select for kind in "fiu"},
-    **{("convert", kind): _convert for kind in "fiub"},
-    **{("bitcast", kind): _bitcast for kind in "fi"},
-    ("abs", "i"): _magnitude,
-    **{(op, "f"): _angle for op in ("angle_rest", "quarter_turns")},
-    ("div", "f"): _quotient,
-    ("is_finite", "f"): _finite,
-    **{("neg", kind): _plain(Value.__neg__) for kind in "fiu"},
-    **{("div", kind): _plain(operator.floordiv) for kind in "iu"},
-    **{("rem", kind): _plain(operator.mod) for kind in "iu"},
-    ("not", "b"): _plain(Value.__invert__),
-    ("rotate_left", "u"): _rotation,
-    **{("shift_left", kind): _plain(operator.lshift) for kind in "iu"},
-    **{("shift_right_logical", kind): _logical_shift for kind in "iu"},
-}
-"""Functions that write an operation, by its name and the kind of its operands."""
-
-
-def _write_of(value: Expr, *, for_gpu: bool = False) -> _Write:
-    """Return the function that writes an operation.
-
-    Raises:
-      UnsupportedError: there is none for numbers of this type, or on this device.
-    """
-    # The instruction depends on the operands' dtype; the first operand of a selection is its
-    # condition.
-    kind = value.operands[0].dtype.kind if value.op != "select" else value.dtype.kind
-    write = _OPERATIONS.get((value.op, kind))
-    if write is None:
-        raise UnsupportedError(f"{value.op} of {value.operands[0].dtype}")
-    if write is _approximation and not for_gpu:
-        raise UnsupportedError(f"an approximate {value.op} on a CPU")
-    return write
