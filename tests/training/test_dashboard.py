@@ -378,7 +378,7 @@ def test_the_dashboard_is_the_one_in_the_documentation(root):
     assert words(picture) - words(shown) - phases == {"left"}
     assert words(shown) - words(picture) == set()
     assert "loss 0.00212   KL 0.012   std 0.46   learning rate 1.0e-03" in shown
-    assert re.search(r"memory  \d\.\d\d GiB", shown)
+    assert re.search(r"memory +\d+\.\d\d GiB", shown)
 
 
 def test_the_update_of_many_seeds_is_their_mean():
