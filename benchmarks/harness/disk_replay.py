@@ -262,7 +262,9 @@ def _decode(text: str) -> bytes:
     return bytes.fromhex(text.replace("\\x", ""))
 
 
-def states(recording: Recording, rng: random.Random) -> Iterator[tuple[State, list[str]]]:
+def states(
+    recording: Recording, rng: random.Random, share: float = 1.0
+) -> Iterator[tuple[State, list[str]]]:
     """Make the states that a loss of power may leave, each once for what was confirmed before.
 
     After each operation: all on the disk, and all with the end of the last write missing. Before
@@ -273,6 +275,7 @@ def states(recording: Recording, rng: random.Random) -> Iterator[tuple[State, li
     Args:
       recording: what `record` returned.
       rng: draws subsets.
+      share: the part of all states that is made, drawn by chance.
 
     Yields:
       A state, and the names that were confirmed before.
@@ -286,6 +289,8 @@ def states(recording: Recording, rng: random.Random) -> Iterator[tuple[State, li
         op = ops[end] if end < len(ops) else None
         is_end = op is None or op.kind == "sync"
         for subset, is_torn in _subsets(earlier, window, rng) if is_end else _last(earlier, window):
+            if rng.random() >= share:
+                continue
             torn = max(subset, default=None) if is_torn else None
             done = [_torn(ops[i]) if i == torn else ops[i] for i in sorted([*covered, *subset])]
             state = _build(done, recording.folders)

@@ -279,9 +279,7 @@ def replay(
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
     recording = record(arguments, recorded, environment)
     count, failures = 0, []
-    for state, confirmed in states(recording, rng):
-        if rng.random() >= share:
-            continue
+    for state, confirmed in states(recording, rng, share):
         count += 1
         write_state(folder / "disk", state)
         try:

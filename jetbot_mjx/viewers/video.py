@@ -10,10 +10,11 @@ import functools
 import io
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
-import imageio.v3 as iio
+import av
 import jax
 import mujoco
 import numpy as np
@@ -394,10 +395,13 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float = FPS) -> None:
 def encode_mp4(frames: Iterable[Frame], fps: float) -> bytes:
     """Return a video as `write_mp4` writes it."""
     file = io.BytesIO()
-    with iio.imopen(file, "w", plugin="pyav", extension=".mp4") as video:
-        video.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")
-        for frame in frames:
-            video.write_frame(frame)
+    with av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps), pix_fmt="yuv420p")
+        for number, frame in enumerate(frames):
+            if number == 0:
+                stream.height, stream.width = frame.shape[:2]
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
+        container.mux(stream.encode())
     return file.getvalue()
 
 

@@ -20,11 +20,11 @@ traced = pytest.mark.skipif(
 @pytest.mark.parametrize(
     ("name", "share", "least"),
     [
-        ("run", 0.01, 100),
+        ("run", 0.005, 50),
         ("files", 1, 10),
         ("export", 1, 100),
         ("programs", 1, 50),
-        ("study", 0.02, 100),
+        ("study", 0.01, 50),
     ],
 )
 def test_nothing_confirmed_is_lost(tmp_path, name, share, least):
