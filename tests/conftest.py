@@ -145,6 +145,15 @@ def freeze_what_stays():
     gc.freeze()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def brief_clips(request):
+    """Lets the clips of reports end in moments, but where they are what is tested."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.stem != "test_clips":
+            patch.setattr("jetbot_mjx.viewers.clips._LONGEST_SECONDS", 0.2)
+        yield
+
+
 @pytest.fixture(scope="session")
 def own_tasks() -> frozenset[str]:
     """The tasks of which a user's programs are kept; the tests keep those of none."""
