@@ -624,6 +624,7 @@ def test_each_of_several_seeds_is_trained_as_if_alone(several, ours):
         assert furthest(state.policy_params[1:], stored[1:]) < 1e-3
 
 
+@pytest.mark.slow
 def test_each_of_several_seeds_has_a_run_of_its_own(several, glide, blank_figures, capsys):
     config, result = several
     folders = sorted(path.name for path in result.run_dir.glob("seed-*"))

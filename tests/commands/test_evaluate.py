@@ -258,6 +258,7 @@ def test_another_simulator_that_there_is_not_is_refused(judged, capfd):
     assert "argument --simulator: invalid choice: 'isaac'" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_ranges_of_a_file_are_evaluated_beside_the_preset(judged, tmp_path):
     run_dir, _, (first, _), _ = judged

@@ -374,6 +374,7 @@ print([name for name in before if before[name] != after[name]])
 """
 
 
+@pytest.mark.slow
 def test_the_functions_leave_the_process_unchanged(tmp_path):
     code = STATE.replace("SETTINGS", repr(SMALL))
     told = fresh(code, str(tmp_path / "run")).splitlines()

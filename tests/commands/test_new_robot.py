@@ -12,7 +12,11 @@ from jetbot_mjx.training import session
 
 
 @pytest.mark.parametrize(
-    ("file", "names"), [("a b.yaml", ["a b.yaml"]), ("r.xml", ["r.xml", "r.yaml"])]
+    ("file", "names"),
+    [
+        pytest.param("a b.yaml", ["a b.yaml"], marks=pytest.mark.slow),
+        ("r.xml", ["r.xml", "r.yaml"]),
+    ],
 )
 def test_what_is_written_passes_the_check_and_trains(tmp_path, capsys, monkeypatch, file, names):
     assert new_robot.main([str(tmp_path / "in" / file)]) == 0

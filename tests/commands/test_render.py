@@ -263,6 +263,7 @@ def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys, s
         assert str(run_copy / "videos" / f"gallery-2.{suffix}") in shown
 
 
+@pytest.mark.slow
 def test_a_gallery_has_a_video_an_animation_and_a_sheet(run_copy, needs_opengl, coarse):
     rendered = render_gallery(run_copy, episodes=2, size=(250, 80))
     film = iio.imread(rendered.files["video"], plugin="pyav")

@@ -118,7 +118,7 @@ HERE = ["plan", "smoke", "--set", "task.name=found_task:Found"]
     ("start", "words"),
     [
         pytest.param(["-m"], BESIDE, id="python -m, beside"),
-        pytest.param(["-P", "-m"], HERE, id="console script, here"),
+        pytest.param(["-P", "-m"], HERE, id="console script, here", marks=pytest.mark.slow),
         pytest.param(["-m"], HERE, id="python -m, here", marks=pytest.mark.slow),
         pytest.param(["-P", "-m"], BESIDE, id="console script, beside", marks=pytest.mark.slow),
     ],

@@ -9,13 +9,15 @@ import pytest
 from benchmarks.reliability import torture
 from benchmarks.reliability.torture import SETTINGS, Aim
 from helpers import point_mass
+from helpers.further import slow_unless
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
 
+CLASSES = ("PointMass", "Choosing")
 LONGER = (*SETTINGS, "checkpoint_interval=4_096", "ppo.num_timesteps=32_768")
 
 
-@pytest.fixture(scope="module", params=["PointMass", "Choosing"])
+@pytest.fixture(scope="module", params=slow_unless("PointMass".__eq__, CLASSES))
 def config(request, tmp_path_factory):
     path = tmp_path_factory.mktemp("configs") / "own.yaml"
     path.write_text(point_mass.config(request.param).to_yaml())

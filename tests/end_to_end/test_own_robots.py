@@ -73,6 +73,7 @@ def test_the_run_holds_what_the_robot_is(trained):
         assert (config.robot.wheel_radius, config.robot.friction) == (0.04, 1.0)
 
 
+@pytest.mark.slow
 @every_kind
 @pytest.mark.usefixtures("blank_figures", "small_videos")
 def test_it_is_evaluated_in_both_simulators_rendered_and_exported(trained, tmp_path):

@@ -25,6 +25,7 @@ def undisturbed(tmp_path_factory):
     return torture.finish(tmp_path_factory.mktemp("torture") / "undisturbed", LONGER, TRAINER)
 
 
+@pytest.mark.slow
 def test_a_training_killed_again_and_again_ends_as_if_it_had_never_been(
     template, undisturbed, tmp_path
 ):

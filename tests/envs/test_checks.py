@@ -93,7 +93,11 @@ def test_a_non_finite_state_is_found_during_a_drive(monkeypatch):
             id="egocentric",
         ),
         *[
-            pytest.param(lambda root, n=n: load_config(root / "examples" / f"{n}.yaml"), id=n)
+            pytest.param(
+                lambda root, n=n: load_config(root / "examples" / f"{n}.yaml"),
+                id=n,
+                marks=[] if n == "gates" else pytest.mark.slow,
+            )
             for n in ("obstacle", "pillars", "gates")
         ],
     ],

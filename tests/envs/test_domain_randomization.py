@@ -207,6 +207,7 @@ def test_only_what_is_drawn_enters_the_physics():
     assert [len(places) for places in varied] == [1]
 
 
+@pytest.mark.slow
 def test_a_training_resumes_to_the_bit_with_everything_drawn(config, tmp_path):
     layers = {f"{name}_hidden_layer_sizes": [8] for name in ("policy", "value")}
     ppo = {"num_envs": 8, "batch_size": 8, "num_minibatches": 1, "unroll_length": 4}

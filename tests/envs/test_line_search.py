@@ -86,7 +86,7 @@ def physics_step(impl):
     ("name", "impl"),
     [
         ("small gain", "auto"),
-        ("small gain", "xla"),
+        pytest.param("small gain", "xla", marks=pytest.mark.slow),
         ("slippery floor", "xla"),
         pytest.param("slippery floor", "auto", marks=pytest.mark.slow),
     ],

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from helpers.broken_robots import BROKEN
+from helpers.further import slow_unless
 from helpers.own_robots import EXAMPLES, OWN_ROBOTS, copy_robot, copy_tricycle, load_robot
 from jetbot_mjx.config import MjcfRobotConfig, load_config, model_files, parse_config
 from jetbot_mjx.envs import make_env
@@ -186,7 +187,7 @@ def drive_both_ways(env, robots, seconds):
     return apart, pushed, theirs
 
 
-@pytest.mark.parametrize("name", OWN_ROBOTS)
+@pytest.mark.parametrize("name", slow_unless("rover".__eq__, OWN_ROBOTS))
 def test_it_drives_as_in_converged_c_mujoco(env_of, name):
     apart, _, places = drive_both_ways(env_of(name), 8, 1.0)
     assert np.median(apart) < 5e-6

@@ -215,6 +215,7 @@ def jax_cache(folder, tmp_path_factory):
         jax.config.update(name, value)
 
 
+@pytest.mark.slow
 def test_what_a_cpu_finds_in_jax_s_cache_is_compiled_once_more_and_written(jax_cache, folder):
     for name in ("one", "another", "third"):
         jax.clear_caches()

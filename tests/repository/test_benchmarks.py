@@ -37,6 +37,7 @@ from benchmarks.throughput import (
     randomization_cost,
     rate_plots,
 )
+from helpers.further import slow_unless
 from helpers.gliding import everywhere
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.state import robot_state
@@ -527,7 +528,7 @@ def test_mujocos_batch_and_rollout_start_from_the_same_states():
     assert np.ptp(ends[0][:, 0]) > 1e-3
 
 
-@pytest.mark.parametrize("name", ["small_solves", "search"])
+@pytest.mark.parametrize("name", ["small_solves", pytest.param("search", marks=pytest.mark.slow)])
 def test_a_program_is_the_same_as_one_kernel_and_by_xla(name, capsys, monkeypatch):
     monkeypatch.setattr(timing, "REPEAT_SECONDS", 0.01)
     assert programs.main([name, "--num-instances", "3,1", "--rounds", "1"]) == 0
@@ -551,7 +552,7 @@ def test_a_gradient_of_steps_in_groups_is_that_of_all_steps():
 
 
 @pytest.mark.parametrize(
-    "name", ["quasiseparable_cholesky", "search", pytest.param("orbits", marks=pytest.mark.slow)]
+    "name", slow_unless("search".__eq__, ["quasiseparable_cholesky", "search", "orbits"])
 )
 def test_no_program_is_faster_than_its_bound(name, monkeypatch):
     monkeypatch.setattr(timing, "REPEAT_SECONDS", 0.05)
@@ -659,7 +660,7 @@ def test_an_ensemble_is_solved_alike_as_one_kernel_and_by_xla(tmp_path, monkeypa
         ensembles.main(["--tolerance", "0"])
 
 
-@pytest.mark.parametrize("friction", [None, 0.2])
+@pytest.mark.parametrize("friction", [pytest.param(None, marks=pytest.mark.slow), 0.2])
 def test_robots_are_compared_with_c_mujoco_under_the_same_commands(friction, monkeypatch):
     env = robot_fidelity.make_jetbot_env(load_config("turtlebot")).blind()
     options = argparse.Namespace(robots=4, seconds=0.5, seed=0)

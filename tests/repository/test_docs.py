@@ -211,6 +211,7 @@ def site(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_a_warning(site):
     assert all((site / page.replace(".md", ".html")).is_file() for page in ALL_PAGES)
     assert not list(site.rglob("*.py"))

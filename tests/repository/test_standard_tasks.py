@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from helpers.further import slow_unless
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import MissingPackageError
 from onekernel import explain, fuse
@@ -23,6 +24,7 @@ GYMNASIUM = {
 """Class of each example with its name in Gymnasium."""
 
 CLASSES = {"cartpole": "Cartpole"} | {name: first for name, (first, _) in GYMNASIUM.items()}
+QUICK = ("cartpole", "reacher", "hopper")
 INSTANCES, STEPS = 8, 40
 
 
@@ -39,7 +41,7 @@ def load(root):
     return load
 
 
-@pytest.fixture(scope="module", params=CLASSES)
+@pytest.fixture(scope="module", params=slow_unless(QUICK.__contains__, CLASSES))
 def task(request, load):
     """One task after another: its name, an environment, and its reset and step as kernels."""
     if request.param in GYMNASIUM:
@@ -84,7 +86,7 @@ def original(task, tmp_path, monkeypatch):
     env.close()
 
 
-@pytest.mark.parametrize("task", GYMNASIUM, indirect=True)
+@pytest.mark.parametrize("task", slow_unless(QUICK.__contains__, GYMNASIUM), indirect=True)
 def test_steps_are_those_of_gymnasium(task, walk, original):
     before, actions, after = walk
     assert (task.env.dt, task.env.action_size) == (original.dt, *original.action_space.shape)
@@ -105,14 +107,14 @@ def test_steps_are_those_of_gymnasium(task, walk, original):
     assert {*np.unique(after.done)} == ({0, 1} if task.name in ("hopper", "walker") else {0})
 
 
-@pytest.mark.parametrize("task", GYMNASIUM, indirect=True)
+@pytest.mark.parametrize("task", slow_unless(QUICK.__contains__, GYMNASIUM), indirect=True)
 def test_rewards_are_the_sums_of_their_terms(task, walk):
     _, _, after = walk
     terms = [x for name, x in after.metrics.items() if name.startswith("reward/")]
     np.testing.assert_allclose(sum(terms), after.reward, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("task", GYMNASIUM, indirect=True)
+@pytest.mark.parametrize("task", slow_unless(QUICK.__contains__, GYMNASIUM), indirect=True)
 def test_episodes_begin_as_those_of_gymnasium(task, original):
     state = jax.vmap(task.reset)(jax.random.split(jax.random.PRNGKey(2), 4096))
     qpos, qvel = np.asarray(state.pipeline_state.qpos), np.asarray(state.pipeline_state.qvel)

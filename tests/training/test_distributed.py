@@ -137,6 +137,7 @@ def test_a_signal_to_one_stops_all_at_the_same_step(stopped):
     assert "SIGTERM: finishing this step" in second.complained
 
 
+@pytest.mark.slow
 def test_only_the_first_prints_and_writes(stopped, finished):
     (first, second), run_dir, _ = stopped
     assert "on 2 x cpu of 2 processes" in first.said

@@ -155,6 +155,7 @@ def test_compiling_before_the_first_checkpoint_it_does_not_wait_for_the_compiler
     assert checkpoint_steps(tmp_path / "run") == []
 
 
+@pytest.mark.slow
 def test_compiling_after_a_checkpoint_it_does_not_wait_for_the_compiler(begun):
     with training(begun, f"dwell(CompiledTrainer, 'compile', {LONG})") as process:
         code = stop(process, "compile")

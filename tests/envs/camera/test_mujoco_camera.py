@@ -100,6 +100,7 @@ def test_what_has_not_moved_is_not_rendered_again(env, with_opengl, monkeypatch)
     np.testing.assert_array_equal(second[[0, 2]], first[[0, 2]])
 
 
+@pytest.mark.slow
 def test_a_policy_is_evaluated_by_both_appearances(with_opengl, monkeypatch):
     settings = ["camera.width=16", "camera.height=16", "task.episode_length=25"]
     settings += ["ppo.network.cnn=tiny"]
