@@ -36,7 +36,8 @@ The parts, each of which imports only from those before it:
 - `wasm`: these to WebAssembly, whose functions a web page calls
 - `check`: a kernel's results beside XLA's
 - `derivatives`: what JAX differentiates, as a kernel forward and one backward
-- `fused`: a function of one instance as one kernel, with another kernel inside
+- `traced`: a traced function as one kernel, with another kernel inside
+- `fused`: a function of one instance, which is traced and launched as one kernel
 - `explanation`: what the compiler made of it
 - `aot`: compiled programs from one process to the next
 - `mujoco`: the step of a MuJoCo model (`fuse_mjx`); the rest of the package needs no MuJoCo

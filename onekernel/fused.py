@@ -24,35 +24,40 @@ Protocol:
 import contextvars
 import dataclasses
 import functools
-import math
 import os
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Literal as Choice
-from typing import cast, overload
+from typing import overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray, Tracer
-from jax.extend.core import ClosedJaxpr, Literal, Var, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
 from onekernel.backends import default_backend
 from onekernel.check import check
 from onekernel.derivatives import Derivatives
 from onekernel.errors import KernelError, UnsupportedError
-from onekernel.kernel import Kernel, called_by, is_debugging, varying_alike, varying_axes
+from onekernel.kernel import Kernel, is_debugging, varying_alike, varying_axes
 from onekernel.keys import with_key, without_key, words_of
-from onekernel.lower import MAX_ARRAY_BYTES, LateProgram, ScalarProgram, scalarize_part
+from onekernel.traced import (
+    arguments_of,
+    dtypes_of,
+    kernel_of,
+    passed_avals,
+    received,
+    to_pass,
+    whole_kernel_of,
+)
 
 CHECK = "ONEKERNEL_CHECK"
 """Environment variable: with `1`, kernels are checked before their first use."""
 
 _SETTINGS = ("jax_threefry_partitionable", "jax_enable_x64", "jax_default_matmul_precision")
 """JAX's settings on which the kernel of a function depends."""
-
-_DTYPES = tuple(map(np.dtype, ("float32", "int32", "uint32", "bool")))
 
 _is_inside: contextvars.ContextVar[bool] = contextvars.ContextVar("is_inside", default=False)
 """Whether a fused function is being traced: those that it calls become parts of it."""
@@ -189,7 +194,9 @@ class Fused:
             return None
         lowered = self.lowered(*arguments)
         jaxpr = lowered.traced.jaxpr
-        if lowered.places or any(x != np.float32 for x in _dtypes([*jaxpr.invars, *jaxpr.outvars])):
+        if lowered.places or any(
+            x != np.float32 for x in dtypes_of([*jaxpr.invars, *jaxpr.outvars])
+        ):
             return None
         # A caller repeats the kernel: its results must look like its first argument.
         carried, tree = jax.tree.flatten(arguments[0])
@@ -272,7 +279,7 @@ class Fused:
         # Its value is not known now, so the kernel takes it as one more argument.
         places = [i for i, x in enumerate(traced.consts) if isinstance(x, Tracer)]
         try:
-            one = _lower(traced, places)
+            one = kernel_of(traced, places)
             # A step inside has brought its own messages; a kernel without one takes those of this
             # object.
             if not one.before:
@@ -286,17 +293,17 @@ class Fused:
         self, kernel: Kernel, traced: ClosedJaxpr, places: Sequence[int] = ()
     ) -> Derivatives:
         """Return what differentiates a kernel of this function, or of one of its derivatives."""
-        arguments, results = _arguments(traced, places), traced.jaxpr.outvars
+        arguments, results = arguments_of(traced, places), traced.jaxpr.outvars
         what = "the derivative of "
 
         def tell(reason: str) -> None:
             self._tell(reason, what)
 
         def make(traced: ClosedJaxpr) -> Kernel:
-            one = _whole(traced, (), is_late=True)
+            one = whole_kernel_of(traced, (), is_late=True)
             one.explain, one.derivatives = self._explain, self._derivatives(one, traced)
             one.on_fallback = tell if self._on_fallback == self._no_back_end else self._on_fallback
-            dtypes[one] = _dtypes(traced.jaxpr.invars), _dtypes(traced.jaxpr.outvars)
+            dtypes[one] = dtypes_of(traced.jaxpr.invars), dtypes_of(traced.jaxpr.outvars)
             return one
 
         def is_ready(one: Kernel) -> bool:
@@ -309,8 +316,8 @@ class Fused:
         dtypes: dict[Kernel, tuple[list[np.dtype], list[np.dtype]]] = {}
         return Derivatives(
             kernel,
-            _passed_avals(arguments),
-            _passed_avals(results),
+            passed_avals(arguments),
+            passed_avals(results),
             trace=_trace_inside,
             make=make,
             is_ready=functools.cache(is_ready),
@@ -348,12 +355,12 @@ class _Lowered:
         self.one.on_batch = functools.cache(self._prepare)
         launch = self.one.as_function()
         constants = [self.traced.consts[i] for i in self.places]
-        arguments = _dtypes(_arguments(self.traced, self.places))
+        arguments = dtypes_of(arguments_of(self.traced, self.places))
 
         def run(*leaves: Array) -> list[Array]:
             pairs = zip((*constants, *leaves), arguments, strict=True)
-            passed = [_to_pass(jnp.asarray(x, dtype)) for x, dtype in pairs]
-            return _received(launch(passed), self._result_dtypes)
+            passed = [to_pass(jnp.asarray(x, dtype)) for x, dtype in pairs]
+            return received(launch(passed), self._result_dtypes)
 
         return run
 
@@ -373,167 +380,12 @@ class _Lowered:
         """
         # What another traced function computes is not known.
         if isinstance(self.one, Kernel) and not (self._is_checked or self.places):
-            check(self.one, _dtypes(_arguments(self.traced, self.places)), self._result_dtypes)
+            check(self.one, dtypes_of(arguments_of(self.traced, self.places)), self._result_dtypes)
             self._is_checked = True
 
     @property
     def _result_dtypes(self) -> list[np.dtype]:
-        return _dtypes(self.traced.jaxpr.outvars)
-
-
-def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
-    """Lower a traced function to a kernel.
-
-    Args:
-      traced: the function.
-      places: the places of those of its constants that are arguments of the kernel, before others.
-
-    Raises:
-      UnsupportedError: an operation cannot be lowered, or there are several kernels in it.
-    """
-    arguments, results = _arguments(traced, places), traced.jaxpr.outvars
-    calls = [x for x in traced.jaxpr.eqns if called_by(x) is not None]
-    # Without a kernel inside, the whole function becomes one that runs once.
-    if not calls:
-        return _whole(traced, places)
-    _check_passed(arguments, results)
-    # Otherwise cut the function at the call. The one step must be plain: not a map, not itself made
-    # of three parts, and called for one instance.
-    step = called_by(calls[0])
-    if len(calls) > 1 or step is None or step.table is not None or step.before or step.after:
-        raise UnsupportedError("more than one kernel")
-    if [tuple(x.aval.shape) for x in calls[0].invars] != step.argument_shapes:
-        raise UnsupportedError("a kernel for several instances")
-    if step.unsupported:
-        raise step.unsupported
-    # The part in front computes the arguments of the call; the part behind computes the results
-    # from the arguments of the function and the results of the call. `scalarize_part` lowers only
-    # what its results need, so the cut needs no list of equations.
-    before = _lower_part(traced, arguments, calls[0].invars)
-    after = _lower_part(traced, [*arguments, *calls[0].outvars], results)
-    return Kernel(
-        step.program,
-        carried=step.carried,
-        steps=step.steps,
-        fallback=_fallback(traced, places),
-        impl=step.impl,
-        explain=step.explain,
-        on_fallback=step.on_fallback,
-        before=before,
-        after=after,
-        argument_dtypes=_passed_dtypes(arguments),
-        result_dtypes=_passed_dtypes(results),
-    )
-
-
-def _whole(traced: ClosedJaxpr, places: Sequence[int], *, is_late: bool = False) -> Kernel:
-    """Return a traced function without a kernel inside as a kernel that runs once.
-
-    Args:
-      traced: the function.
-      places: as for `_lower`.
-      is_late: whether it is lowered when it is compiled.
-
-    Raises:
-      UnsupportedError: an operation cannot be lowered.
-    """
-    arguments, results = _arguments(traced, places), traced.jaxpr.outvars
-
-    def lower() -> ScalarProgram:
-        _check_passed(arguments, results)
-        return _lower_part(traced, arguments, results)
-
-    shapes = [[x.shape for x in _passed_avals(atoms)] for atoms in (arguments, results)]
-    return Kernel(
-        LateProgram(lower, *shapes) if is_late else lower(),
-        carried=0,
-        steps=1,
-        fallback=_fallback(traced, places),
-        argument_dtypes=_passed_dtypes(arguments),
-        result_dtypes=_passed_dtypes(results),
-    )
-
-
-def _lower_part(
-    traced: ClosedJaxpr, arguments: Sequence[Var], results: Sequence[Var | Literal]
-) -> ScalarProgram:
-    """Lower a part of a traced function, whose arguments and results are those of a kernel."""
-    # Functions around a step test whether its state is finite, so here NaN must stay NaN.
-    return scalarize_part(traced, arguments, results, words=True, finite=False)
-
-
-def _check_passed(arguments: Sequence[Var], results: Sequence[Var | Literal]) -> None:
-    """Raise an error if a kernel cannot have these arguments and results."""
-    # A kernel without arguments has no instances.
-    if not arguments:
-        raise UnsupportedError("a function of nothing")
-    for dtype in _dtypes([*arguments, *results]):
-        if dtype not in _DTYPES:
-            raise UnsupportedError(f"arguments or results of {dtype}")
-    # LLVM takes 10 s for a kernel that reads and writes 10,000 numbers, and 46 s for 40,000.
-    count = 4 * sum(math.prod(x.aval.shape) for x in [*arguments, *results])
-    if count > MAX_ARRAY_BYTES:
-        raise UnsupportedError(
-            f"arguments and results of {count:,} bytes for each instance, more than"
-            f" {MAX_ARRAY_BYTES:,}"
-        )
-
-
-def _arguments(traced: ClosedJaxpr, places: Sequence[int]) -> list[Var]:
-    """Return the variables of a jaxpr that are arguments of its kernel."""
-    return [*(traced.jaxpr.constvars[i] for i in places), *traced.jaxpr.invars]
-
-
-def _dtypes(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
-    return [np.dtype(cast(ShapedArray, atom.aval).dtype) for atom in atoms]
-
-
-def _fallback(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
-    """Return the same computation in JAX, of what is passed to the kernel."""
-    dtypes, result_dtypes = _dtypes(_arguments(traced, places)), _dtypes(traced.jaxpr.outvars)
-    function = _as_function(traced, places)
-
-    def run(*passed: Array) -> list[Array]:
-        # A result that is a literal of the jaxpr is a number of Python here.
-        pairs = zip(function(*_received(passed, dtypes)), result_dtypes, strict=True)
-        return [_to_pass(jnp.asarray(x, dtype)) for x, dtype in pairs]
-
-    return run
-
-
-def _as_function(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
-    """Return a traced function as one of all arguments of its kernel, which XLA computes."""
-
-    def run(*arguments: Array) -> list[Array]:
-        constants = list(traced.consts)
-        # The first arguments are constants; `zip` stops after these.
-        for place, argument in zip(places, arguments, strict=False):
-            constants[place] = argument
-        closed = ClosedJaxpr(traced.jaxpr, constants)
-        return jaxpr_as_fun(closed)(*arguments[len(places) :])
-
-    return run
-
-
-# A kernel takes and returns numbers of 32 bits as they are, and a bool as 0.0 or 1.0.
-
-
-def _passed_dtypes(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
-    return [np.dtype(np.float32) if dtype.kind == "b" else dtype for dtype in _dtypes(atoms)]
-
-
-def _passed_avals(atoms: Sequence[Var | Literal]) -> list[ShapedArray]:
-    pairs = zip(atoms, _passed_dtypes(atoms), strict=True)
-    return [cast(ShapedArray, x.aval).update(dtype=t, weak_type=False) for x, t in pairs]
-
-
-def _to_pass(x: Array) -> Array:
-    return x.astype(jnp.float32) if x.dtype.kind == "b" else x
-
-
-def _received(passed: Sequence[Array], dtypes: Sequence[np.dtype]) -> list[Array]:
-    pairs = zip(passed, dtypes, strict=True)
-    return [x != 0 if dtype.kind == "b" else x for x, dtype in pairs]
+        return dtypes_of(self.traced.jaxpr.outvars)
 
 
 def _as_array(x: PyTree) -> Array:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from onekernel import KernelError, default_backend, fuse, fused
+from onekernel import KernelError, default_backend, fuse, fused, traced
 from onekernel.check import check
 
 pytestmark = pytest.mark.skipif(default_backend() is None, reason="no back end for kernels")
@@ -24,7 +24,7 @@ def compare(right, wrong, *arguments):
     one, other = (fuse(f, on_unsupported="raise").lowered(*arguments) for f in (wrong, right))
     kernel = dataclasses.replace(one.one, fallback=other.one.fallback)
     jaxpr = other.traced.jaxpr
-    check(kernel, fused._dtypes(jaxpr.invars), fused._dtypes(jaxpr.outvars))
+    check(kernel, traced.dtypes_of(jaxpr.invars), traced.dtypes_of(jaxpr.outvars))
 
 
 def gelu(x, *, root=1.0, cube=1.0, half=1.0):

@@ -12,7 +12,7 @@ import pytest
 
 import onekernel
 from helpers.small_kernels import launches
-from onekernel import KernelError, UnsupportedError, cpu, fuse, fused
+from onekernel import KernelError, UnsupportedError, cpu, fuse, fused, traced
 from onekernel.build import BACKENDS
 
 pytestmark = [
@@ -252,13 +252,13 @@ def test_a_platform_without_kernels_is_told(monkeypatch):
 
 
 def test_a_wrong_kernel_is_found_before_its_first_use(monkeypatch):
-    lowered = fused.scalarize_part
+    lowered = traced.scalarize_part
 
     def wrong(traced, arguments, results, **options):
         # The kernel returns its first result twice.
         return lowered(traced, arguments, [results[0]] * len(results), **options)
 
-    monkeypatch.setattr(fused, "scalarize_part", wrong)
+    monkeypatch.setattr(traced, "scalarize_part", wrong)
     # The first number that differs is told, not the first of all.
     both = fuse(lambda x: (x, jnp.where(jnp.arange(3) > 1, 123.0, x)))
     message = r"^result 1 of a kernel is not XLA's: \S+ instead of 123 at \[2\] in 65 of 65 random"

@@ -16,7 +16,7 @@ from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.wrappers import EpisodeWrapper, NewEpisodeWrapper, wrap_for_training
 from jetbot_mjx.packed import pack
-from onekernel import KernelError, cpu, fuse, fused, gpu, kernel
+from onekernel import KernelError, cpu, fuse, gpu, kernel, traced
 from onekernel.lower.jaxpr import scalarize
 
 LANES = cpu.host_processor().lanes
@@ -549,13 +549,13 @@ def test_nan_reaches_what_comes_after_physics(drive, where):
 def counted(monkeypatch):
     """What is lowered to scalars, one after the other."""
     lowered = []
-    part = fused.scalarize_part
+    part = traced.scalarize_part
 
     def count(*arguments, **options):
         lowered.append(arguments)
         return part(*arguments, **options)
 
-    monkeypatch.setattr(fused, "scalarize_part", count)
+    monkeypatch.setattr(traced, "scalarize_part", count)
     return lowered
 
 

@@ -43,8 +43,8 @@ which are for others' programs, or `startup`, which is for commands."""
 
 ENGINE_ORDER = (
     *("errors", "background", "trusted_files", "lower", "codegen", "keys", "kernel", "fingerprint"),
-    *("cpu", "gpu", "wasm", "backends", "round_off", "check", "derivatives", "fused"),
-    *("explanation", "aot", "build", "mujoco"),
+    *("cpu", "gpu", "wasm", "backends", "round_off", "check", "derivatives", "traced"),
+    *("fused", "explanation", "aot", "build", "mujoco"),
 )
 """Modules and rooms of the engine: each imports only itself and those before it."""
 

@@ -53,6 +53,7 @@ TOGETHER = {
     "evaluation/test_evaluator": "evaluation.rollout",
     "evaluation/test_plots": "evaluation.learning_curves",
     "onekernel/test_fuse": "onekernel.explanation",
+    "onekernel/test_fused": "onekernel.traced",
     "onekernel/test_llvm_backend": "onekernel.cpu",
     "onekernel/test_llvm_codegen": "onekernel.codegen onekernel.cpu",
     "onekernel/test_lower_jaxpr": "onekernel.lower.jaxpr onekernel.lower.control_flow"
