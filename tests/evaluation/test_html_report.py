@@ -10,10 +10,11 @@ import pytest
 from helpers import chromium
 from helpers.reports import make_episodes, make_report, polar
 from helpers.unpainted import unpainted
+from jetbot_mjx.envs import OTHER_NUMERICS
 from jetbot_mjx.evaluation.comparison import compare
 from jetbot_mjx.evaluation.curves import CurvePoint
 from jetbot_mjx.evaluation.html_report import write_comparison, write_report
-from jetbot_mjx.evaluation.robustness import SWEEPS, SweepResult
+from jetbot_mjx.evaluation.robustness import SWEEPS, MujocoResult, SweepResult
 from jetbot_mjx.evaluation.tables import summarize_comparison, summarize_report
 
 LONG_RUN = "runs/a-run-with-a-name-that-is-as-long-as-people-make-them-20261123-101500"
@@ -67,6 +68,25 @@ def pages(tmp_path_factory):
 def text_of(page):
     """What a reader sees of a page, without line breaks."""
     return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "", page.read_text("utf-8")))
+
+
+def test_a_comparison_has_both_simulators_pictures_of_policies_that_see(tmp_path):
+    report = report_of(tmp_path, np.ones(6))
+    few = report.policy._replace(episodes=3, successes=2, success_rate=2 / 3)
+    seen = MujocoResult(
+        OTHER_NUMERICS, report.policy, None, {"plain": report.policy, "varied": few}
+    )
+    runs = {
+        "camera": {"seed-0": report._replace(mujoco=seen)},
+        "blind": {"seed-0": report_of(tmp_path, np.ones(6), "blind")},
+    }
+    with unpainted():
+        page = write_comparison(compare(tmp_path / "comparison", runs))
+    for text in (text_of(page), text_of(page.with_suffix(".md"))):
+        rows = re.findall(r"camera in C MuJoCo, (plain|varied) pictures\W+([\d.]+)", text)
+        assert rows == [("plain", "100.00"), ("varied", "66.67")]
+        assert "blind in C MuJoCo" not in text
+        assert "on the first 3 goals" in text
 
 
 class Tables(HTMLParser):
