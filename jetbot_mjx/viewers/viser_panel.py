@@ -12,6 +12,7 @@ from jetbot_mjx.viewers.player import SPEEDS, Player
 from jetbot_mjx.viewers.step_fns import AGENTS, KEYBOARD
 from jetbot_mjx.viewers.viser_camera import CAMERAS
 from jetbot_mjx.viewers.viser_policy_view import PolicyView
+from jetbot_mjx.viewers.viser_recorder import Recorder
 from jetbot_mjx.viewers.viser_scene import Scene
 
 _BUTTONS = ("Step", "New episode")
@@ -95,6 +96,7 @@ class ControlPanel:
             "Camera", CAMERAS, initial_value=self._scene.cameras.mode
         )
         shadows = gui.add_checkbox("Shadows", False)
+        self.recorder = Recorder(gui)
         self.agent.on_update(lambda _: self._ask(self._switch_agent))
         self.checkpoint.on_update(lambda _: self._ask(self._switch_checkpoint))
         self.buttons.on_click(lambda event: self._ask(self._press, event.target.value))

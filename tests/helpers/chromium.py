@@ -92,6 +92,25 @@ class Page:
             time.sleep(0.1)
         self.mouse("Released", *points[-1])
 
+    def become_a_telephone(self, width=400, height=800):
+        """Has a small screen that is touched from here on."""
+        self._call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=True,
+        )
+        self._call("Emulation.setTouchEmulationEnabled", enabled=True)
+
+    def touch(self, *points):
+        """Puts a finger on a point, moves it to the others, and lifts it."""
+        for index, (x, y) in enumerate(points):
+            kind = "touchMove" if index else "touchStart"
+            self._call("Input.dispatchTouchEvent", type=kind, touchPoints=[{"x": x, "y": y}])
+            time.sleep(0.1)
+        self._call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
     def press(self, key):
         for kind in ("keyDown", "keyUp"):
             self._call(

@@ -1,13 +1,17 @@
 """The page in a headless browser: its contents, clicks, drags and keys."""
 
+import io
 import math
 import threading
 import time
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 
 pytest.importorskip("viser")
+
+from viser import ClientHandle
 
 from helpers import chromium
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
@@ -65,9 +69,13 @@ def page(served, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def see(served, page):
-    """Where a place in the world [m] is on the page [pixels]."""
     browser, _ = served
     (client,) = browser.server.get_clients().values()
+    return projection(page, client)
+
+
+def projection(page, client):
+    """A function from a place in the world [m] to where it is on the page [pixels]."""
 
     def see(place):
         camera = client.camera
@@ -210,3 +218,56 @@ def test_keys_drive_once_the_user_is_the_agent(served, page):
     for key in "iij":
         page.press(key)
     wait_for("the keys", lambda: player.command == pytest.approx((0.25, math.pi / 8), abs=0.02))
+
+
+def button(page, label):
+    return middle(
+        page, f"[...document.querySelectorAll('button')].find((one) => one.innerText === {label!r})"
+    )
+
+
+def test_a_clip_shows_what_the_page_shows(served, page, see, monkeypatch):
+    _, player = served
+    put(player, served, (-0.3, 0.2))
+    wait_for("the goal on the page", shows_the_goal(page, see, player))
+    files = []
+    monkeypatch.setattr(
+        ClientHandle,
+        "send_file_download",
+        lambda _, name, content, save_immediately: files.append((name, content)),
+    )
+    page.click(*button(page, "Record a clip"))
+    place = button(page, "Stop and save the clip")
+    time.sleep(1.0)
+    page.click(*place)
+    wait_for("the file", lambda: files)
+    wait_for("the button", lambda: button(page, "Record a clip"))
+    ((name, content),) = files
+    assert name == "jetbot.mp4"
+    frames = iio.imread(io.BytesIO(content), plugin="pyav", extension=".mp4")
+    assert len(frames) >= 2
+    width, height = page.evaluate("[innerWidth, innerHeight]")
+    scale = frames.shape[1] / height
+    assert frames.shape[2] == pytest.approx(width * scale, abs=4)
+    found = red(frames[-1])
+    assert math.dist(found, np.multiply(scale, see(player.snapshot.goal_w))) < 12
+
+
+def test_a_finger_drags_the_goal_on_a_telephone(served, page):
+    """The last: the page stays small."""
+    browser, player = served
+    before = set(browser.server.get_clients())
+    page.become_a_telephone()
+    page.open(f"http://127.0.0.1:{browser.server.get_port()}/?fixedDpr=1")
+    clients = browser.server.get_clients
+    (number,) = wait_for("the small page's camera", lambda: set(clients()) - before)
+    client = clients()[number]
+    client.camera.position, client.camera.look_at = (-0.52, -1.06, 1.2), (0.14, -0.1, 0.0)
+    see = projection(page, client)
+    browser._ask(player.reset)
+    put(player, served, (0.1, 0.2))
+    wait_for("the small page", shows_the_goal(page, see, player))
+    x, y, z = map(float, player.snapshot.goal_w)
+    places = [(x - step / 2, y + step, z) for step in np.linspace(0.0, 0.2, 6)]
+    page.touch(*[see(place) for place in places])
+    wait_for("the drag", lambda: np.allclose(player.snapshot.goal_w[:2], places[-1][:2], atol=0.04))
