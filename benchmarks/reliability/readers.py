@@ -185,7 +185,10 @@ def _study_samples() -> list[bytes]:
         study = Search(config, space, folder).study
         with search.quiet():
             for _ in range(3):
-                study.tell(study.ask(), 0.5)
+                trial = study.ask()
+                for one in space:
+                    one.suggest(trial)
+                study.tell(trial, 0.5)
         with contextlib.closing(sqlite3.connect(folder / "study.db")) as database:
             database.execute("VACUUM")
         return [(folder / "study.db").read_bytes()]

@@ -60,6 +60,8 @@ _STATES = optuna.trial.TrialState
 _STORAGE_ERRORS = optuna.exceptions.StorageInternalError, sqlalchemy.exc.SQLAlchemyError
 _OPENING_ERRORS = ImportError, ValueError, RuntimeError
 """Raised for a missing driver, an invalid port, or the database of another version of Optuna."""
+_DAMAGE = ValueError, LookupError, TypeError, ArithmeticError
+"""Raised by Optuna for a database in which it finds other values than it stores."""
 
 SCORES: Mapping[ScoredBy, str] = {"success": "success_rate", "return": "episode_return"}
 """What a stored trial calls its last score."""
@@ -156,7 +158,7 @@ class Search:
         self._url = storage or file.render_as_string()
         self._retry = optuna.storages.RetryHeartbeatStaleTrialCallback()
         try:
-            with stage("opening the study"), self._reports_storage(*_OPENING_ERRORS):
+            with stage("opening the study"), self._reports_storage(*_OPENING_ERRORS, *_DAMAGE):
                 self._storage = self._open()
                 self.study = optuna.create_study(
                     storage=self._storage,
@@ -165,8 +167,11 @@ class Search:
                     direction="maximize",
                     load_if_exists=True,
                 )
-            with self._reports_storage():
+            with self._reports_storage(*_DAMAGE):
                 self._check_study()
+                # Read all trials once, so that a damaged database is refused before any training.
+                for trial in ranked_trials(self.study):
+                    self.values_of(trial)
         except UserError:
             if new and not any(folder.iterdir()):
                 folder.rmdir()
@@ -207,7 +212,8 @@ class Search:
           UserError: no trial of a round could be trained, the memory is too small, or the
             storage cannot be used.
         """
-        done = len(completed_trials(self.study))
+        with self._reports_storage():
+            done = len(completed_trials(self.study))
         with self._reports_storage(), stage("trials", max(0, trials - done)) as advance:
             while (count := min(round_size, self._next_round(trials))) > 0:
                 self._run_round(count, trials)
@@ -329,6 +335,8 @@ class Search:
         """Convert the errors of a database, and others, to a one-line `UserError`."""
         try:
             yield
+        except UserError:
+            raise
         except (*_STORAGE_ERRORS, *errors) as error:
             # Optuna's own message names only what may have happened.
             reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)

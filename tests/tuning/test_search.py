@@ -1,6 +1,8 @@
 """A study resumes, shares its trials among workers, and loses none."""
 
+import contextlib
 import os
+import sqlite3
 import sys
 import threading
 from pathlib import Path
@@ -313,6 +315,29 @@ def test_the_best_configuration_has_its_robots_model_beside_it(tmp_path, monkeyp
 def test_a_storage_that_cannot_be_used_is_named(tmp_path):
     with pytest.raises(UserError, match="--storage nonsense cannot be used"):
         search.Search(CONFIG, SPACE, tmp_path / "s", storage="nonsense")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE study_user_attributes SET value_json = 'smoke'",
+        "UPDATE trials SET state = 'FINISHED'",
+        "UPDATE trials SET datetime_start = 'yesterday'",
+        "UPDATE trial_params SET distribution_json = '{}'",
+        "DELETE FROM trial_params",
+        "UPDATE study_directions SET direction = 'ONWARDS'",
+    ],
+)
+def test_a_damaged_study_is_refused_before_a_training(tmp_path, damage):
+    search.Search(CONFIG, SPACE, tmp_path / "s").run(2, 2)
+    with contextlib.closing(sqlite3.connect(tmp_path / "s" / "study.db")) as database:
+        database.execute(damage)
+        database.commit()
+    Quick.calls = []
+    with pytest.raises(UserError, match=r"--storage sqlite:.*study\.db cannot be used: ") as caught:
+        search.Search(CONFIG, SPACE, tmp_path / "s").run(3, 1)
+    assert "\n" not in str(caught.value)
+    assert Quick.calls == []
 
 
 def test_no_connection_to_the_study_stays_open(tmp_path):
