@@ -45,6 +45,7 @@ _LABEL_RGB, _LABEL_WIDTH = (110, 118, 128), 0.006  # of the metres on the floor;
 _TRAIL_POINTS = 40  # of one robot
 _TRAIL_PER_REACH = 2.0  # length of a trail, relative to the largest goal distance
 _TRAIL_FRAMES = 3  # frames per update of the trails
+_TOUCH_FLOOR_HEIGHT = -0.002  # [m] below lines and trails
 _TRAIL_HEIGHT = 0.004  # [m]
 _TRAIL_WIDTH = 0.012  # [m]
 _TRAIL_RGB, _CHOSEN_RGB = (25, 90, 215), (235, 120, 0)
@@ -83,6 +84,7 @@ class Scene:
         self._add_surroundings()
         self._parts = self._add_bodies()
         server.scene.on_click()(self._on_click)
+        self._add_touch_floor()
         robots_w = self._robots_w()
         self._path_w = np.repeat(robots_w[:, None], _TRAIL_POINTS, axis=1)
         self._low_w, self._high_w = robots_w.copy(), robots_w.copy()
@@ -281,7 +283,26 @@ class Scene:
             parts.append((body, rgb, node))
         return parts
 
-    def _on_click(self, event: viser.SceneClickEvent) -> None:
+    def _add_touch_floor(self) -> None:
+        """Add a floor that nobody sees, for fingers: viser tells their taps on objects only."""
+        edge = self._edge
+        corners = [(-edge, -edge, 0.0), (edge, -edge, 0.0), (edge, edge, 0.0), (-edge, edge, 0.0)]
+        floor = self._server.scene.add_mesh_simple(
+            "/touch floor",
+            np.array(corners, np.float32),
+            np.array([(0, 1, 2), (0, 2, 3)], np.uint32),
+            # Of three lines, for a plane that fills the page would halve the frame rate.
+            wireframe=True,
+            opacity=0.0,
+            cast_shadow=False,
+            receive_shadow=False,
+            position=(0.0, 0.0, _TOUCH_FLOOR_HEIGHT),
+        )
+        floor.on_click(self._on_click)
+
+    def _on_click(
+        self, event: viser.SceneClickEvent | viser.SceneNodePointerEvent[viser.MeshHandle]
+    ) -> None:
         self.point(event.ray_origin, event.ray_direction)
 
     async def _on_drag(self, event: viser.SceneNodeDragEvent[viser.BatchedMeshHandle]) -> None:

@@ -253,7 +253,7 @@ def test_a_clip_shows_what_the_page_shows(served, page, see, monkeypatch):
     assert math.dist(found, np.multiply(scale, see(player.snapshot.goal_w))) < 12
 
 
-def test_a_finger_drags_the_goal_on_a_telephone(served, page):
+def test_a_telephone_is_touched(served, page):
     """The last: the page stays small."""
     browser, player = served
     before = set(browser.server.get_clients())
@@ -267,7 +267,12 @@ def test_a_finger_drags_the_goal_on_a_telephone(served, page):
     browser._ask(player.reset)
     put(player, served, (0.1, 0.2))
     wait_for("the small page", shows_the_goal(page, see, player))
+    # A tap moves the goal, and so does a finger that drags it.
+    target = (-0.1, 0.3)
+    page.touch(see((*target, 0.0)))
+    wait_for("the tap", lambda: np.allclose(player.snapshot.goal_w[:2], target, atol=0.03))
+    wait_for("the goal on the page", shows_the_goal(page, see, player))
     x, y, z = map(float, player.snapshot.goal_w)
-    places = [(x - step / 2, y + step, z) for step in np.linspace(0.0, 0.2, 6)]
+    places = [(x + step, y + step, z) for step in np.linspace(0.0, 0.2, 6)]
     page.touch(*[see(place) for place in places])
     wait_for("the drag", lambda: np.allclose(player.snapshot.goal_w[:2], places[-1][:2], atol=0.04))
