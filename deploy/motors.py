@@ -76,7 +76,9 @@ def check_calibration(calibration: Calibration) -> Calibration:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise DriveError(f"{name} = {value!r} is not a number")
         if not low <= value <= high:
-            raise DriveError(f"{name} = {value:g} is not between {low:g} and {high:g}")
+            # A whole number of a file may be too large for a float.
+            told = f"{value:g}" if isinstance(value, float) else str(value)[:20]
+            raise DriveError(f"{name} = {told} is not between {low:g} and {high:g}")
     return calibration
 
 

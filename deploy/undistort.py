@@ -20,6 +20,9 @@ _LARGEST_SIDE = 100000
 _MOST_CHARACTERS = 1000000
 """Longest file of a calibration."""
 
+_LARGEST_NUMBER = 1e6
+"""Largest number of a calibration: a length in pixels, or a coefficient without a unit."""
+
 _TURN_STEPS = 64
 """Steps from the optical axis to a direction in which a polynomial that turns back is found."""
 
@@ -86,9 +89,13 @@ def _numbers(text: str, names: tuple, path: str) -> list:
             f"--undistort {path} is not a calibration: it lacks {names[0]} with its data in [...]"
         )
     try:
-        return [float(one) for one in found.group(1).replace(",", " ").split()]
+        numbers = [float(one) for one in found.group(1).replace(",", " ").split()]
     except ValueError as error:
         raise DriveError(f"--undistort {path} is not a calibration: {names[0]}: {error}")
+    for number in numbers:
+        if not abs(number) <= _LARGEST_NUMBER:
+            raise DriveError(f"--undistort {path}: {names[0]} has {number:g}, which no lens has")
+    return numbers
 
 
 def _size(text: str, path: str) -> tuple:

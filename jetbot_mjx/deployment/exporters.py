@@ -157,7 +157,12 @@ def read_exported(folder: Path) -> Policy:
         act = _act_of(_numpy_text(known, numbers[1]), path)
         # What is missing or does not fit shows in the first action.
         zeros = {"image": np.zeros(known["image"] or 0, np.uint8)}
-        act(*(zeros.get(name, np.zeros(known["shapes"][0])) for name in known["inputs"]))
+        with np.errstate(divide="raise", invalid="raise", over="ignore"):
+            found = act(
+                *(zeros.get(name, np.zeros(known["shapes"][0])) for name in known["inputs"])
+            )
+        if not all(np.isfinite(one).all() for one in found):
+            raise ValueError("its actions are not finite")
     except RecursionError:
         raise UserError(f"{path} is not an exported policy: it is nested too deeply") from None
     except (ValueError, LookupError, TypeError, ArithmeticError, AttributeError) as error:

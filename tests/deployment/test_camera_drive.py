@@ -184,6 +184,8 @@ def test_a_calibration_of_opencv_is_read_and_bends_as_the_package_unbends(tmp_pa
         ("", "lacks camera_matrix"),
         (YAML.format(more="", count=2, numbers="1, x"), "lacks|could not convert"),
         (YAML.format(more="", count=1, numbers="0").replace("image_width", "w"), "image_width"),
+        (YAML.format(more="", count=2, numbers="0, 1e308"), r"has 1e\+308, which no lens has"),
+        (YAML.format(more="", count=2, numbers="-Infinity, 0"), "has -inf, which no lens has"),
         (YAML.format(more="", count=9, numbers="0,0,0,0,0,0,0,0,1"), "takes 8 coefficients"),
         (YAML.format(more="", count=1, numbers="0").replace("640", "9" * 5000), "are impossible"),
         (NO_BRACKETS, r"lacks distortion_coefficients with its data in \[\.\.\.\]"),

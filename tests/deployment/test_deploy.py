@@ -649,6 +649,7 @@ def test_calibration_finds_dead_bands_and_full_speeds(tmp_path, monkeypatch, cap
             lambda c: c["right"].update(full_speed="fast"),
             "right.full_speed = 'fast' is not a number",
         ),
+        (lambda c: c["right"].update(full_speed=10**400), "right.full_speed = 10+ is not between"),
         (lambda c: c["right"].update(speed=1), "is not a calibration"),
     ],
 )
