@@ -4,6 +4,8 @@ VENV ?= .venv
 # The versions to install; the newest ones with CONSTRAINTS=/dev/null.
 CONSTRAINTS ?= constraints.txt
 CONFIG ?= configs/jetbot.yaml
+# What `make test-slow` runs: a folder or a file.
+TESTS ?= tests
 RUN ?= runs/$(notdir $(basename $(CONFIG)))-$(shell date +%Y%m%d-%H%M%S)
 
 BIN := $(VENV)/bin
@@ -48,7 +50,7 @@ test-gpu: setup
 	$(BIN)/python tests/on_gpu.py
 
 test-slow: setup
-	$(BIN)/python -m pytest -m slow -o faulthandler_timeout=7200
+	$(BIN)/python -m pytest -m slow -o faulthandler_timeout=7200 $(TESTS)
 
 check: setup
 	$(BIN)/ruff format --check .

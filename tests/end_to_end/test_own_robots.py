@@ -107,6 +107,7 @@ def test_it_is_evaluated_in_both_simulators_rendered_and_exported(trained, tmp_p
         assert "axle midpoint" in spec["frames"]["body"]
 
 
+@pytest.mark.slow
 @every_kind
 def test_a_training_that_is_continued_ends_with_the_same_bits(trained, tmp_path):
     config = stored_config(trained)

@@ -190,6 +190,7 @@ def test_training_notebook_runs(trained):
     assert "best policy" in text(trained)
 
 
+@pytest.mark.slow
 def test_evaluation_notebook_shows_the_run_of_the_training_notebook(execute, trained):
     notebook = execute("03_evaluate_and_render")
     assert images(notebook) == ["image/png", "image/png", "image/gif"]

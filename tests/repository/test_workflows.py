@@ -39,6 +39,20 @@ def test_no_job_may_do_more_than_it_needs(workflows):
     assert [job["environment"] for job in writers if "pages" not in job["permissions"]] == ["pypi"]
 
 
+def test_the_slow_tests_of_every_room_run_once_a_week(workflows, root):
+    job = workflows["weekly.yml"]["jobs"]["slow"]
+    rooms = {
+        path.relative_to(root / "tests").parts[0]
+        for path in (root / "tests").rglob("test_*.py")
+        if re.search(r"mark\.slow|slow_unless", path.read_text("utf-8"))
+    }
+    assert {*job["strategy"]["matrix"]["room"]} == rooms
+    assert job["steps"][-1] == {
+        "run": "make test-slow",
+        "env": {"TESTS": "tests/${{ matrix.room }}"},
+    }
+
+
 def test_an_action_has_one_version(workflows):
     used = [step["uses"] for job in jobs(workflows) for step in job["steps"] if "uses" in step]
     names = {use: use.partition("@")[0] for use in used}

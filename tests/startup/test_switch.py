@@ -99,6 +99,7 @@ def test_another_value_is_refused():
     assert done.stderr == "error: JETBOT_MJX_PLAIN_START = 'yes' is neither 0 nor 1\n"
 
 
+@pytest.mark.slow
 def test_a_plain_training_and_evaluation_do_the_same(tmp_path):
     run = str(tmp_path / "run")
     steps = ["--set", "ppo.num_timesteps=8_192", "--set", "checkpoint_interval=8_192"]

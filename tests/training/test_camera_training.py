@@ -79,6 +79,7 @@ def sums(run_dir, env_steps=3 * STEP):
     return read_about(checkpoint_path(run_dir, env_steps))["sha256"]
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_ends_with_the_same_bits(run, config_file):
     parts = shutil.copytree(run, config_file.with_name("parts"))
     for steps in (2 * STEP, 3 * STEP):

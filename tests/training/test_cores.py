@@ -46,6 +46,7 @@ def train(root, folder, cores):
     )
 
 
+@pytest.mark.slow
 def test_one_core_and_two_train_to_the_same_bits(root, tmp_path):
     cores = sorted(os.sched_getaffinity(0))[:2]
     trainings = [train(root, tmp_path / f"{n}", cores[:n]) for n in (1, 2)]

@@ -153,6 +153,7 @@ def test_only_the_first_prints_and_writes(stopped, finished):
     }
 
 
+@pytest.mark.slow
 def test_they_go_on_where_they_were_stopped(finished):
     (first, second), run_dir = finished
     assert (first.code, second.code) == (0, 0), first.err + second.err
