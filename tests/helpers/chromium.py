@@ -94,13 +94,7 @@ class Page:
 
     def become_a_telephone(self, width=400, height=800):
         """Has a small screen that is touched from here on."""
-        self._call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=True,
-        )
+        self.resize(width, height)
         self._call("Emulation.setTouchEmulationEnabled", enabled=True)
 
     def touch(self, *points):
