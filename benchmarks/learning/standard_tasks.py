@@ -1,6 +1,7 @@
-"""Learn the standard tasks, and beside them with Stable-Baselines3's PPO, on a CPU.
+"""Learn the standard tasks, on a CPU beside Stable-Baselines3's PPO, or on a GPU with many seeds.
 
     python benchmarks/learning/standard_tasks.py --limit 300
+    python benchmarks/learning/standard_tasks.py --gpu --seeds 5
 
 Each example is trained to its target with one seed and an empty compilation cache. Then
 Stable-Baselines3's PPO learns for `--limit` seconds, or to the same target, in Gymnasium's own
@@ -10,13 +11,18 @@ one environment and one thread, as there. Cart-pole swing-up has no equivalent i
 A return is the mean of deterministic episodes: 256 of an example, of which the time is part of the
 training's, and 20 with Stable-Baselines3, of which it is not.
 
+With `--gpu`, the configurations `..._gpu` are trained to their targets: seed 0 with an empty
+cache, and then every seed with the cache that it filled. Stable-Baselines3 is left out.
+
     pip install '.[sb3]' 'gymnasium[mujoco]'
 """
 
 import argparse
 import importlib
 import importlib.util
+import math
 import os
+import statistics
 import sys
 import tempfile
 import time
@@ -170,19 +176,15 @@ def learn_with_sb3(name: str, limit: float, seed: int) -> Iterator[list[dict[str
         yield points
 
 
-def _learn_here(name: str, task: StandardTask, seed: int) -> dict[str, Any]:
-    """Train an example to its target from a cold start."""
-    stop = "stop_at_success" if task.target.metric == SUCCESS else "stop_at_return"
+def _learn_here(config: str, target: Target, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """Train an example to its target with each seed; the first one has an empty cache."""
+    stop = "stop_at_success" if target.metric == SUCCESS else "stop_at_return"
+    file, stops = ROOT / "examples" / f"{config}.yaml", [f"{stop}={target.value}"]
     with tempfile.TemporaryDirectory() as cache:
-        run = measure(
-            ROOT / "examples" / f"{name}.yaml",
-            [f"{stop}={task.target.value}"],
-            seed=seed,
-            target=task.target,
-            cache=Path(cache),
-        )
-    del run["output"]
-    return run
+        runs = [measure(file, stops, seed, target, Path(cache)) for seed in seeds]
+    for run in runs:
+        del run["output"]
+    return runs
 
 
 def _learn_beside(name: str, limit: float, seed: int) -> list[dict[str, float]]:
@@ -222,6 +224,18 @@ def _line(name: str, row: Mapping[str, Any], target: Target) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def _gpu_line(name: str, runs: Sequence[Mapping[str, Any]], target: Target) -> str:
+    """Return the row of a task that was learned by seed 0 from a cold start, then by every seed."""
+    cells = [name, target.format(target.value)]
+    for some in (runs[:1], runs[1:]):
+        times = [run["target_reached_seconds"] or math.inf for run in some]
+        cells.append(f"{statistics.median(times):.1f} s ({max(times):.1f})")
+    steps = [run["target_reached_steps"] or math.inf for run in runs[1:]]
+    scores = [run["policy"][target.metric] for run in runs[1:]]
+    cells += [f"{statistics.median(steps):,.0f}", target.format(statistics.median(scores))]
+    return f"| {' | '.join(cells)} |"
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"default: {' '.join(TASKS)}")
@@ -233,11 +247,14 @@ def _parser() -> argparse.ArgumentParser:
         help="of Stable-Baselines3, for each task (default: 300)",
     )
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
+    parser.add_argument("--gpu", action="store_true", help="on a GPU, without Stable-Baselines3")
+    parser.add_argument(
+        "--seeds", type=cli.positive_int, default=5, help="with --gpu: seeds 0 to N-1 (default: 5)"
+    )
     parser.add_argument(
         "--output",
         type=Path,
-        default=RESULTS / "standard-tasks-cpu.json",
-        help="JSON file (default: results/standard-tasks-cpu.json)",
+        help="JSON file (default: results/standard-tasks-cpu.json, or -gpu.json)",
     )
     return parser
 
@@ -258,7 +275,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = options.tasks or list(TASKS)
     if unknown := [name for name in names if name not in TASKS]:
         raise UserError(f"there is no task {unknown[0]!r}: give some of {', '.join(TASKS)}")
-    check_output(options.output)
+    device = "gpu" if options.gpu else "cpu"
+    output = options.output or RESULTS / f"standard-tasks-{device}.json"
+    check_output(output)
+    measure_tasks = _with_many_seeds if options.gpu else _beside_sb3
+    return 0 if measure_tasks(names, options, output) else 1
+
+
+def _with_many_seeds(names: Sequence[str], options: argparse.Namespace, output: Path) -> bool:
+    """Measure the configurations for a GPU; return whether every training reached its target."""
+    tasks: dict[str, Any] = {}
+    results = {"cpu_cores": os.cpu_count(), "processor": processor(), "tasks": tasks}
+    print(
+        "| task | target | cold | warm, median (worst) | steps | in the report |\n"
+        "|---|--:|--:|--:|--:|--:|",
+        flush=True,
+    )
+    for name in names:
+        target = TASKS[name].target
+        tasks[name] = _learn_here(f"{name}_gpu", target, [0, *range(options.seeds)])
+        write(output, results)
+        print(_gpu_line(name, tasks[name], target), flush=True)
+    return all(run["target_reached_seconds"] for runs in tasks.values() for run in runs)
+
+
+def _beside_sb3(names: Sequence[str], options: argparse.Namespace, output: Path) -> bool:
+    """Measure the configurations for a CPU; return whether every training reached its target.
+
+    Raises:
+      UserError: A package is missing.
+    """
     packages = ("stable_baselines3", "torch", "gymnasium", "mujoco")
     if absent := [name for name in packages if importlib.util.find_spec(name) is None]:
         raise UserError(f"{absent[0]} is not installed: pip install '.[sb3]' 'gymnasium[mujoco]'")
@@ -280,15 +326,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in names:
         task = TASKS[name]
         row: dict[str, Any] = {"sb3": None}
-        row["here"], row["here_load"] = _loaded(_learn_here, name, task, options.seed)
+        (row["here"],), row["here_load"] = _loaded(_learn_here, name, task.target, [options.seed])
         if task.gymnasium:
             row["sb3"], row["sb3_load"] = _loaded(_learn_beside, name, options.limit, options.seed)
         results["tasks"][name] = row
         # After every task, so that an interrupted command keeps what it has measured.
-        write(options.output, results)
+        write(output, results)
         print(_line(name, row, task.target), flush=True)
-    reached = [one["here"]["target_reached_seconds"] for one in results["tasks"].values()]
-    return 0 if None not in reached else 1
+    return all(one["here"]["target_reached_seconds"] for one in results["tasks"].values())
 
 
 if __name__ == "__main__":

@@ -3,9 +3,9 @@
 One process trains. At the end of every interval it notes its memory, open files, threads, the
 memory of its device, what its logs grew by, and the rate of steps. A line is fitted to each of
 them: one drifts if its slope is larger than three times its standard error, and changes it by more
-than a hundredth over the whole time. With `--kills` a second training is killed at random moments,
-by SIGKILL and SIGTERM in turn, and resumed until it ends as one that was never disturbed, again and
-again until there were so many kills.
+than a hundredth over the whole time. With `--kills`, other trainings are killed at random moments
+and resumed until they end as one that was never disturbed, again and again until there were so many
+kills, five of six by SIGKILL and one by SIGTERM. `--jobs` of them run at a time.
 
 A checkpoint leaves about 7 KB in TensorStore 0.1.86, which its authors have to mend: so much growth
 of the memory an interval is told, and is no drift.
@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -168,47 +169,76 @@ def _size_of_logs(run_dir: Path) -> int:
 class Kills(NamedTuple):
     """A `Kills` holds how often a training was killed, and what became of it."""
 
-    killed: int
-    terminated: int
-    ended: int
+    killed: int = 0
+    terminated: int = 0
+    ended: int = 0
     """Trainings that came to their end, each bit-identical to the one that was not disturbed."""
+
+    def __add__(self, other: tuple[int, ...]) -> "Kills":
+        """Return the sums."""
+        return Kills(*map(sum, zip(self, other, strict=True)))
 
 
 def kill_often(
-    config: Path, settings: Sequence[str], folder: Path, kills: int, rng: random.Random
+    config: Path,
+    settings: Sequence[str],
+    folder: Path,
+    kills: int,
+    *,
+    jobs: int = 1,
+    seed: int = 0,
 ) -> Kills:
-    """Kill a training at random moments and resume it until there were enough kills.
+    """Kill trainings at random moments and resume them until there were enough kills.
 
     Args:
       config: the configuration file.
       settings: settings, as for `--set`.
       folder: an empty folder.
-      kills: number of kills, by SIGKILL and SIGTERM in turn.
-      rng: the generator of the moments.
+      kills: number of kills, at least; every sixth is by SIGTERM and the others by SIGKILL.
+      jobs: number of trainings at a time.
+      seed: the seed of the moments.
 
     Raises:
       RecoveryError: a training did not resume, or did not end as the one that was not disturbed.
     """
     began = time.monotonic()
     wanted = finish(folder / "undisturbed", settings, config=config)
-    longest, run_dir = time.monotonic() - began, folder / "killed"
-    counts, ended = {signal.SIGKILL: 0, signal.SIGTERM: 0}, 0
-    while (done := sum(counts.values())) < kills:
-        number = signal.SIGKILL if done % 2 == 0 else signal.SIGTERM
-        with Process(run_dir, settings, config=config) as process:
-            time.sleep(rng.uniform(0.0, longest))
-            process.send(number)
-            process.wait()
-        if "Traceback" in process.stderr:
-            raise RecoveryError(f"after {number.name} it printed:\n{process.stderr}")
-        counts[number] += 1
-        # Now and then to the end, so that many are compared; and after the last kill.
-        if rng.random() < 0.2 or done + 1 == kills:
-            if finish(run_dir, settings, config=config) != wanted:
-                raise RecoveryError(f"{run_dir} ended otherwise than {folder / 'undisturbed'}")
-            ended += 1
-            shutil.rmtree(run_dir)
-    return Kills(counts[signal.SIGKILL], counts[signal.SIGTERM], ended)
+    longest = time.monotonic() - began
+    numbers = iter(range(kills))  # of the kills; its `next` is one operation of Python
+
+    def one_job(job: int) -> Kills:
+        rng, run_dir, done = random.Random(f"{seed} {job}"), folder / f"killed-{job}", Kills()
+        for number in numbers:
+            sent = signal.SIGTERM if number % 6 == 5 else signal.SIGKILL
+            _kill_once(run_dir, settings, config, sent, rng.uniform(0.0, longest))
+            done += Kills(*(int(sent == each) for each in (signal.SIGKILL, signal.SIGTERM)))
+            # Now and then to the end, so that many are compared.
+            if rng.random() < 0.2:
+                done += end(run_dir)
+        return done + end(run_dir)
+
+    def end(run_dir: Path) -> Kills:
+        if not run_dir.exists():
+            return Kills()
+        if finish(run_dir, settings, config=config) != wanted:
+            raise RecoveryError(f"{run_dir} ended otherwise than {folder / 'undisturbed'}")
+        shutil.rmtree(run_dir)
+        return Kills(ended=1)
+
+    with ThreadPoolExecutor(jobs) as threads:
+        return sum(threads.map(one_job, range(jobs)), Kills())
+
+
+def _kill_once(
+    run_dir: Path, settings: Sequence[str], config: Path, number: signal.Signals, seconds: float
+) -> None:
+    """Start or resume a training, and end it by a signal after so many seconds."""
+    with Process(run_dir, settings, config=config) as process:
+        time.sleep(seconds)
+        process.send(number)
+        process.wait()
+    if "Traceback" in process.stderr:
+        raise RecoveryError(f"after {number.name} it printed:\n{process.stderr}")
 
 
 def plot(samples: Sequence[Sample], slopes: Sequence[Slope]) -> Figure:
@@ -242,6 +272,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--run-dir", type=Path, help="run folder (default: one that is removed)")
     parser.add_argument("--seconds", type=float, default=600, help="longest time (default: 600)")
     parser.add_argument("--kills", type=int, default=0, help="number of kills (default: 0)")
+    parser.add_argument(
+        "--jobs", type=cli.positive_int, default=1, help="trainings that are killed at a time"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the moments of the kills")
     parser.add_argument("--output", type=Path, help="JSON file; a plot is written beside it")
     return parser
@@ -283,9 +316,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _kill(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Kill a training as often as asked for; return what became of it as JSON."""
     file = find_config(options.config)
-    rng = random.Random(options.seed)
+    kills, jobs, seed = options.kills, options.jobs, options.seed
     try:
-        done = kill_often(file, options.overrides, folder, options.kills, rng)
+        done = kill_often(file, options.overrides, folder, kills, jobs=jobs, seed=seed)
     except RecoveryError as error:
         print(f"a killed training did not recover: {error}")
         return {"failure": str(error)}

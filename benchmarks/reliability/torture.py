@@ -242,9 +242,9 @@ def check_start(process: Process, known: Sequence[int]) -> None:
         traceback.
     """
     printed = process.stdout + process.stderr
-    resumed = [
-        int(steps.replace(",", "")) for steps in re.findall(r"resuming after ([\d,]+)", printed)
-    ]
+    # A training may have come to its end before the kill: the next one finds nothing to do.
+    found = re.findall(r"(?:resuming|complete) after ([\d,]+)", printed)
+    resumed = [int(steps.replace(",", "")) for steps in found]
     started = "run folder: " in printed or "best policy: " in printed
     wanted = [known[-1]] if known and (started or resumed) else []
     if resumed != wanted or "skipped: " in printed or "Traceback" in printed:
