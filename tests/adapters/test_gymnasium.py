@@ -176,6 +176,7 @@ def test_actions_of_another_shape_are_not_dealt_out_to_other_robots():
             batch.step(wrong)
 
 
+@pytest.mark.slow
 def test_infinite_actions_are_clipped_and_nan_actions_end_the_episode():
     actions = np.array([[np.inf, -np.inf], [-np.inf, np.inf], [np.nan, 0.0], [0.0, np.nan]])
     ours = JetBotVectorEnv(4)
@@ -309,6 +310,7 @@ print(env.render().shape)
     return subprocess.run(command, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_gymnasium_finds_the_environment_in_a_fresh_process(fresh_process):
     assert fresh_process.stdout.startswith("JetBot-v0\n"), fresh_process.stderr[-2000:]
 

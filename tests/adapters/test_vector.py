@@ -55,6 +55,7 @@ than MJX: where wheels slide, and where a pillar is struck, 16 robots were 0.1 m
 seconds, and 1 mrad. A full-speed step covers 17 mm; a pillar elsewhere would tell in decimetres."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", TASKS)
 def test_every_task_is_the_same_in_c_in_the_batch_and_in_training(config, monkeypatch):
     """Compare episodes to their end and on, with the infos that Gymnasium prescribes."""

@@ -111,6 +111,7 @@ def traced_update(policies, *, at_once):
     return jax.jit(jax.vmap(fused.update)).trace(*made), shape.size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policies", [None, 3])
 def test_a_minibatch_of_several_policies_is_three_launches(monkeypatch, policies):
     pytest.importorskip("llvmlite")

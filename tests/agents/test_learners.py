@@ -134,6 +134,7 @@ TINY = {
 }
 
 
+@pytest.mark.slow
 def test_a_training_whose_kernels_fail_their_check_is_that_of_xla(root, monkeypatch):
     smoke = load_config(root / "configs" / "smoke.yaml").model_dump(mode="json")
 

@@ -222,6 +222,7 @@ def test_several_training_steps_are_brax_s(side_by_side):
         )
 
 
+@pytest.mark.slow
 def test_the_keys_go_on_as_within_an_epoch_of_brax(smoke, ours):
     env, one = ours(Gliding, "NONE", 1.0)
     ppo = one.ppo.config.model_copy(update={"num_timesteps": STEPS * SIZE})
@@ -255,6 +256,7 @@ def normalized(smoke):
     return make
 
 
+@pytest.mark.slow
 def test_no_deviation_is_below_its_physical_scale(normalized):
     env, statistics = normalized("physical")
     floor = env.observation_min_std
@@ -268,6 +270,7 @@ def test_no_deviation_is_below_its_physical_scale(normalized):
     np.testing.assert_array_equal(seen.std[steady], floor[steady])
 
 
+@pytest.mark.slow
 def test_the_floor_changes_nothing_but_the_deviations(normalized):
     env, (_, ours, later) = normalized("physical")
     _, (_, stock, stock_later) = normalized("brax")
@@ -538,6 +541,7 @@ class Doomed(GoalTask):
         return jnp.where(doomed & off, jnp.nan, reward), terms
 
 
+@pytest.mark.slow
 def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, monkeypatch, capsys):
     config = with_ppo(smoke, num_timesteps=131_072, checkpoint_interval=32_768)
     sound = loss.ppo_loss
@@ -573,6 +577,7 @@ def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, m
     assert last.endswith("reward")
 
 
+@pytest.mark.slow
 def test_a_training_compiles_its_step_once_and_nothing_later(smoke, glide, tmp_path, monkeypatch):
     compiled, after_report = [], []
 
@@ -641,6 +646,7 @@ def test_each_of_several_seeds_has_a_run_of_its_own(several, glide, blank_figure
     assert "policy" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_several_seeds_resume_to_the_bit(several, glide, tmp_path, capsys):
     config, result = several
     session.run(with_ppo(config, num_timesteps=SIZE), tmp_path / "run")

@@ -76,7 +76,14 @@ CASES = {
 
 
 # Their steps are among those of the quick cases, and so are several parts and policies.
-FURTHER = "jetbot", "egocentric", "smoke", "more than a part"
+FURTHER = (
+    "jetbot",
+    "egocentric",
+    "smoke",
+    "more than a part",
+    "parts of odd sizes",
+    "not normalised",
+)
 
 
 @pytest.mark.parametrize("case", slow_unless(lambda case: case not in FURTHER, CASES))

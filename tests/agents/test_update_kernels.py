@@ -49,6 +49,7 @@ def drawn(shape, environments):
 FURTHER_ADVANTAGES = "three layers of 128", "four layers, small tiles", SWISH
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_unless(lambda name: name not in FURTHER_ADVANTAGES, CASES))
 def test_the_advantages_are_those_of_float64(name):
     case = CASES[name]
@@ -173,6 +174,7 @@ QUICK_ROWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rows"),
     slow_unless(lambda name, rows: name in QUICK_ROWS[rows], itertools.product(CASES, QUICK_ROWS)),
@@ -200,6 +202,7 @@ QUICK_ENVIRONMENTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.cpu
 @pytest.mark.parametrize(
     ("name", "environments"),
@@ -250,6 +253,7 @@ def test_a_tile_of_actions_fills_the_gpu(environments, memory, rows):
     assert gpu_tiling.best_tiling("actions", shape, batch, 132, memory).rows == rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "architecture"),
     slow_unless(

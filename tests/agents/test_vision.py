@@ -27,6 +27,7 @@ def full_precision():
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("extra_rows", "extra_columns"), [(0, 0), (2, 11)])
 @pytest.mark.parametrize("layer", LAYERS)
 def test_a_convolution_is_xla_s(layer, extra_rows, extra_columns):
@@ -185,6 +186,7 @@ def separate():
     return params, batch, result
 
 
+@pytest.mark.slow
 def test_the_loss_of_separate_encoders_is_that_of_brax_s_networks(separate):
     params, batch, ((loss, metrics), gradient) = separate
     layers = cnn_sizes.CNNS["small"]

@@ -227,6 +227,7 @@ return { found, changed, again };
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("activation", NETWORKS)
 def test_the_layers_of_any_policy_are_applied_as_jax_does(activation):
     actions, sizes = 3, SIZES[activation]

@@ -121,6 +121,7 @@ def test_a_command_that_names_nothing_is_refused(capsys):
     assert "give a configuration, or a class as package.module:Class" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_robots_own_model_decides_what_touches_the_floor(root, capsys):
     assert check_env.main(["--config", str(root / "examples" / "turtlebot.yaml")]) == 0
     assert "is in no contact pair" not in capsys.readouterr().out

@@ -125,6 +125,7 @@ def test_measures_are_checked(checked, root):
     assert "real: 0.694 kg" in printed
 
 
+@pytest.mark.slow
 def test_what_a_step_costs_is_told(capsys):
     assert check_robot.main([str(EXAMPLES / "turtlebot.yaml")]) == 0
     printed = capsys.readouterr().out

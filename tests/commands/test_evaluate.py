@@ -119,6 +119,7 @@ def judged(smoke_run, tmp_path_factory):
     return run_dir, folder, left, texts
 
 
+@pytest.mark.slow
 def test_two_evaluations_leave_the_same_bytes(judged):
     _, _, (first, second), (said, again) = judged
     assert set(first) == FIGURES | PAGES
@@ -184,6 +185,7 @@ def test_the_markdown_shows_the_figures_beside_it(judged):
         assert len({line.count("|") for line in table.strip().splitlines()}) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_a_sweep_is_reported_with_a_table_and_a_figure(judged, tmp_path, monkeypatch):
     run_dir, _, (first, _), _ = judged
@@ -224,6 +226,7 @@ def test_a_sweep_is_reported_with_a_table_and_a_figure(judged, tmp_path, monkeyp
     assert not (tmp_path / "robustness.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_another_simulator_is_told_beside_the_one_of_the_training(judged, tmp_path):
     run_dir, _, (first, _), _ = judged
@@ -380,6 +383,7 @@ def several(smoke_run, still, tmp_path_factory):
         return folder, *judge(*runs, "--min-success", "0.01", "--simulator", "mujoco")
 
 
+@pytest.mark.slow
 def test_runs_are_compared_beside_their_own_reports(several):
     folder, code, said = several
     home = folder / "five" / "evaluations" / f"comparison-{EPISODES}-goals"

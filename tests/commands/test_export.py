@@ -362,6 +362,7 @@ def seeing(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cnn", "camera", "observation", "distribution"),
     [
@@ -401,6 +402,7 @@ def test_every_encoder_is_written_as_it_is(cnn, camera, observation, distributio
     assert speeds.shape == (2,)
 
 
+@pytest.mark.slow
 def test_the_recording_of_a_policy_that_sees_is_of_its_drives(seeing, capsys):
     checkpoint = load_checkpoint("pretrained:jetbot_camera")
     env = checkpoint.make_env()
@@ -463,6 +465,7 @@ def test_the_time_of_a_frame_is_told_for_every_file(seeing, capsys):
     assert [row[0] for row in rows] == list(FORMATS)
 
 
+@pytest.mark.slow
 def test_the_caller_stacks_images_as_the_environment_does(tmp_path):
     settings = {"task": {"observation": "camera"}, "camera": {"frames": 3}}
     checkpoint, env = checkpoint_of(settings, tmp_path)
@@ -611,6 +614,7 @@ def own(request, tmp_path_factory):
     return run_dir, run_dir / "policy"
 
 
+@pytest.mark.slow
 def test_a_policy_of_an_environment_is_exported_with_its_contract(own):
     _, folder = own
     spec = json.loads((folder / "policy.json").read_text())

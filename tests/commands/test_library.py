@@ -180,6 +180,7 @@ def test_a_run_is_rendered(trained, with_opengl, monkeypatch, capfd):
     assert len(repr(rendered)) < 1000
 
 
+@pytest.mark.slow
 def test_hyperparameters_are_searched(tmp_path, monkeypatch, blank_figures, capfd):
     optuna = pytest.importorskip("optuna")
     from helpers.quick_trials import Quick
@@ -381,6 +382,7 @@ def test_the_functions_leave_the_process_unchanged(tmp_path):
     assert told[-1] == "[]"
 
 
+@pytest.mark.slow
 def test_a_training_works_in_a_thread_beside_a_running_loop(tmp_path):
     async def main():
         with gliding.everywhere():

@@ -182,6 +182,7 @@ def port():
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "answer"), ROWS, ids=[command for command, _ in ROWS])
 def test_a_mistake_is_answered_by_the_pages_line(home, type_, command, answer):
     before = sorted(home.rglob("*"))

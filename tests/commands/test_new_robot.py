@@ -11,6 +11,7 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.training import session
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "names"),
     [

@@ -11,6 +11,7 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.training import session
 
 
+@pytest.mark.slow
 def test_what_is_written_passes_the_checks_and_trains(tmp_path, capsys):
     assert new_task.main([str(tmp_path / "park_here.py")]) == 0
     config = tmp_path / "park_here.yaml"

@@ -53,7 +53,8 @@ def test_it_was_trained_by_the_configuration_of_its_name(name, root):
     assert load_checkpoint(PRETRAINED / name).config == trained
 
 
-# One that sees and one that does not. The report of "jetbot_egocentric" below is quick as well.
+# One that sees and one that does not. The report of "jetbot_egocentric" below is quick.
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["camera_real", "real_jetbot"])
 @pytest.mark.usefixtures("optimized")
 def test_it_reaches_the_first_goals_of_the_report(name):

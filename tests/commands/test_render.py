@@ -275,6 +275,7 @@ def test_a_gallery_has_a_video_an_animation_and_a_sheet(run_copy, needs_opengl, 
     assert list(rendered.successes) == [0, 32_768, 65_536]
 
 
+@pytest.mark.slow
 def test_the_smallest_gallery_is_rendered(run_copy, needs_opengl, coarse):
     rendered = render_gallery(run_copy, episodes=1, size=(64, 64))
     assert iio.imread(rendered.files["video"], plugin="pyav").shape[1:] == (64, 60, 3)
@@ -312,6 +313,7 @@ def test_a_wanted_backend_is_the_only_one_tried(monkeypatch):
         opengl.find_backend.cache_clear()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wanted", "said"),
     [

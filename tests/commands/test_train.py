@@ -118,6 +118,7 @@ def test_the_same_seed_trains_the_same_policy(smoke_run, tmp_path, root, capsys)
     assert load_config(tmp_path / "other" / "config.yaml").seed == 1
 
 
+@pytest.mark.slow
 def test_the_stock_trainer_leaves_the_same_kind_of_run(root, tmp_path, capsys):
     arguments = ["--config", str(root / "configs" / "smoke.yaml"), "--set", "trainer=brax"]
     arguments += ["--set", "ppo.learning_rate_schedule=LINEAR"]
@@ -134,6 +135,7 @@ def test_the_stock_trainer_leaves_the_same_kind_of_run(root, tmp_path, capsys):
         train.main(arguments)
 
 
+@pytest.mark.slow
 def test_training_stops_at_the_success_asked_for(root, tmp_path, capsys):
     config = load_config(root / "configs" / "smoke.yaml", ["stop_at_success=0.01"])
     result = session.run(config, tmp_path / "run")

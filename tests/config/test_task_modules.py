@@ -114,6 +114,7 @@ BESIDE = ["plan", "../my tasks/found.yaml"]
 HERE = ["plan", "smoke", "--set", "task.name=found_task:Found"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("start", "words"),
     [
@@ -130,6 +131,7 @@ def test_both_ways_to_start_a_command_find_it(places, start, words):
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.slow
 def test_the_commands_that_new_task_prints_work_as_they_are(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert new_task.main(["my tasks/park it/parking_spot.py"]) == 0

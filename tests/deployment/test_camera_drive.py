@@ -475,6 +475,7 @@ def test_poses_have_no_place_beside_a_camera(folder, name, capsys):
     assert capsys.readouterr().err == said
 
 
+@pytest.mark.slow
 def test_a_policy_that_steers_by_sight_reaches_its_goals_through_latency_and_losses(with_opengl):
     outcomes = [
         rehearsal("varied").drive(goal, 12.0, number)
@@ -484,6 +485,7 @@ def test_a_policy_that_steers_by_sight_reaches_its_goals_through_latency_and_los
     assert max(one.distance for one in outcomes) < 0.12
 
 
+@pytest.mark.slow
 def test_faults_stop_it_in_time_and_without_a_cube_it_turns(with_opengl):
     found = rehearsal()
     cases = found.faults(2)
@@ -530,6 +532,7 @@ def test_a_lost_motor_value_leaves_the_one_before():
     assert len(robot._pending) in range(20, 60)
 
 
+@pytest.mark.slow
 def test_what_a_lens_bends_is_straight_again(with_opengl):
     """Compare a bent picture, taken out, with the picture of a camera without distortion."""
     bent = {"matrix": (80.0, 80.0, 112.0, 110.0), "calibration_size": (224, 224)}

@@ -303,6 +303,7 @@ def test_the_same_seed_is_the_same_fleet_and_the_scripted_driver_arrives(page):
     assert found["time"] == pytest.approx(400 * page.env.dt)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_unless(lambda name: name == "camera_real", CAMERAS))
 def test_the_camera_sees_what_the_packages_does_and_the_policy_acts_on_it(name):
     page, steps, count = shipped(name), 12, 5

@@ -172,6 +172,7 @@ def test_a_task_that_reads_its_settings_as_plain_numbers_has_no_knobs(tmp_path):
     assert successes > 0.9 * episodes
 
 
+@pytest.mark.slow
 def test_a_goal_that_its_task_cannot_move_stays(tmp_path):
     # The task inherits a `move_goal` for goals that are positions.
     page = linked_page(tmp_path / "run", own_task(tmp_path, FIXED, "FixedTask"))

@@ -312,6 +312,7 @@ def training(page, observations):
     return page.run(body, seed=SEED, obs=observations.ravel())
 
 
+@pytest.mark.slow
 def test_what_a_page_downloads_is_read_and_acts_as_on_the_page(
     training, observations, page, tmp_path
 ):

@@ -237,6 +237,7 @@ def test_a_documented_play_drives(page, words, reader, monkeypatch, capsys):
     assert "0 of 0 goals reached" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "words"), of_kind("python", "-m", "jetbot_mjx.plan"))
 def test_a_documented_plan_tells_what_fits(page, words, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
@@ -334,6 +335,7 @@ def test_the_page_about_real_robots_leads_to_a_comparison(reader, real_run, monk
     assert "mm at the end" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_documented_tasks_are_written_and_checked(tmp_path):
     found = [
         one.values

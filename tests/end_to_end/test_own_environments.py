@@ -24,6 +24,7 @@ def config(request, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_training_that_was_killed_ends_as_if_it_had_never_been(config, tmp_path):
     template = torture.make_template(LONGER, config)
     undisturbed = torture.finish(tmp_path / "undisturbed", LONGER, config=config)
@@ -35,6 +36,7 @@ def test_a_training_that_was_killed_ends_as_if_it_had_never_been(config, tmp_pat
     assert torture.differences(undisturbed, killed) == []
 
 
+@pytest.mark.slow
 def test_two_seeds_train_on_two_devices(config, tmp_path):
     settings = ["--set", "cpu_devices=2", "--set", "seeds=2", "--run-dir", str(tmp_path / "run")]
     command = [sys.executable, "-m", "jetbot_mjx.train", "--config", str(config), *settings]

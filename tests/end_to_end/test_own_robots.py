@@ -63,6 +63,7 @@ def trained(request, tmp_path_factory):
         yield folder / "run"
 
 
+@pytest.mark.slow
 @every_kind
 def test_the_run_holds_what_the_robot_is(trained):
     config = stored_config(trained)

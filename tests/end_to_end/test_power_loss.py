@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.harness.disk_replay import Op, Recording, record, states
 from benchmarks.reliability import power_loss
+from helpers.further import slow_unless
 
 traced = pytest.mark.skipif(
     shutil.which("strace") is None or not sys.platform.startswith("linux"),
@@ -19,13 +20,16 @@ traced = pytest.mark.skipif(
 @traced
 @pytest.mark.parametrize(
     ("name", "share", "least"),
-    [
-        ("run", 0.005, 50),
-        ("files", 1, 10),
-        ("export", 1, 100),
-        ("programs", 1, 50),
-        ("study", 0.01, 50),
-    ],
+    slow_unless(
+        lambda name, *_: name in ("run", "export"),
+        [
+            ("run", 0.005, 50),
+            ("files", 1, 10),
+            ("export", 1, 100),
+            ("programs", 1, 50),
+            ("study", 0.01, 50),
+        ],
+    ),
 )
 def test_nothing_confirmed_is_lost(tmp_path, name, share, least):
     row = power_loss.replay(name, tmp_path, share=share)
@@ -55,6 +59,7 @@ BROKEN_TOO = {
 """Of scenarios that import JAX."""
 
 
+@pytest.mark.slow
 @traced
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_missing_sync_is_found_out(tmp_path, name):

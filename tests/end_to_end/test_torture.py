@@ -60,6 +60,7 @@ def test_a_start_from_elsewhere_is_seen(said):
         torture.check_start(SimpleNamespace(stdout=said, stderr=""), [0, 8_192])
 
 
+@pytest.mark.slow
 def test_a_difference_at_the_end_is_reported(undisturbed):
     assert set(undisturbed.digests) == {"policy", "training"}
     for name in torture.Outcome._fields:

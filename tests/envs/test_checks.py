@@ -84,6 +84,7 @@ def test_a_non_finite_state_is_found_during_a_drive(monkeypatch):
     assert "1024 of 1024 steps are not finite" in messages[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [

@@ -152,6 +152,7 @@ PENDULUM = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("xml", [None, PENDULUM.format("")], ids=["robot", "weld and limit"])
 def test_relative_costs_are_differences_of_mjx_costs(xml):
     model, data, context = problem(xml)
@@ -188,6 +189,7 @@ def test_a_search_ends_where_mjxs_does_when_the_gain_is_large():
     assert ours.cost == context.cost
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("xml", "cone"),
     [
@@ -230,6 +232,7 @@ def test_threads_take_turns():
     assert solver._linesearch is library[0]
 
 
+@pytest.mark.slow
 def test_another_thread_has_mjx_s_own_line_search_meanwhile():
     mj_model = mujoco.MjModel.from_xml_string(SPHERE)
     model, first = mjx.put_model(mj_model), mjx.make_data(mj_model)

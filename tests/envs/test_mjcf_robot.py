@@ -120,6 +120,7 @@ def test_what_mjx_leaves_out_unsaid_is_refused(tmp_path, old, new, said):
         make_env(load_config(copy_robot(tmp_path, "rover", [(old, new)])))
 
 
+@pytest.mark.slow
 def test_motors_without_limits_may_be_integrated_implicitly(tmp_path):
     changes = [('forcerange="-1.2 1.2"', ""), ("<worldbody>", IMPLICIT + "<worldbody>")]
     env = make_env(load_config(copy_robot(tmp_path, "rover", changes)))
@@ -223,6 +224,7 @@ def own_drive(tmp_path):
     return copy_robot(tmp_path, "rover", settings=own)
 
 
+@pytest.mark.slow
 def test_an_own_function_drives_all_actuators(own_drive):
     env = make_env(load_config(own_drive))
     assert env.action_size == 4

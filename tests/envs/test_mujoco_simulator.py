@@ -280,6 +280,7 @@ def test_without_a_cpu_for_jax_it_says_what_to_set(world_env, monkeypatch):
         in_mujoco(world_env)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "run", [pytest.param("jetbot_egocentric", marks=pytest.mark.slow), "real_jetbot"]
 )

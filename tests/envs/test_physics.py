@@ -226,6 +226,7 @@ def test_straight_driving_and_spinning_match_closed_form(driver):
     np.testing.assert_allclose(velocity[2, 5], expected[2, 1], rtol=CLOSED_FORM_TOLERANCE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("driver", "friction"),
     [
@@ -250,6 +251,7 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     assert tilt < WORST_TILT
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     (gpu if jax.default_backend() == "gpu" else cpu).obstacle() is not None,
     reason="XLA takes no kernels here",

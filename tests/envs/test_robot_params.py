@@ -109,6 +109,7 @@ def test_without_a_difference_the_robot_is_its_preset_to_the_bit(driver):
     jax.tree.map(np.testing.assert_array_equal, varied(RobotParams()), env.mjx_model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "driver", [pytest.param("isaac", marks=pytest.mark.slow), "real"], indirect=True
 )
@@ -238,6 +239,7 @@ def test_one_program_serves_all_values(driver):
     assert drive._cache_size() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "tolerance"), [("turtlebot", 3e-3), ("car", 3e-3), ("rover", 0.1)]
 )

@@ -25,6 +25,7 @@ def test_three_successes_and_the_first_failures_are_shown(success, goals):
     assert clip_goals(Outcomes(success)) == goals
 
 
+@pytest.mark.slow
 def test_a_report_shows_its_clips_or_why_it_has_none(smoke_run, tmp_path, blank_figures):
     def make(env, episodes, goals):
         return [Clip(goal, bool(episodes.success[goal] > 0), 2, b"mp4") for goal in goals]

@@ -56,6 +56,7 @@ def places_of(page, values):
     return {place for _, place in found}
 
 
+@pytest.mark.slow
 def test_a_report_holds_the_returns_and_shows_them(folder, compared):
     home = folder / "one" / "evaluations" / f"000000002048-{EPISODES}-episodes"
     assert {path.name for path in home.iterdir()} == {

@@ -65,6 +65,7 @@ def test_one_success_and_the_first_failures_are_shown():
     assert shown_goals(episodes._replace(success=np.zeros(13))) == [*range(8)]
 
 
+@pytest.mark.slow
 def test_images_are_those_of_the_recorded_episodes(env, episodes, seen):
     assert [one.goal for one in seen] == shown_goals(episodes)
     assert {one.success for one in seen} == {True, False}
@@ -98,6 +99,7 @@ def test_the_figure_has_a_row_for_each_episode(seen):
     assert figure.axes[6].get_ylabel().endswith("missed")
 
 
+@pytest.mark.slow
 def test_a_report_shows_what_the_policy_saw(tmp_path):
     report = evaluate_run("pretrained:jetbot_camera", episodes=GOALS, output=tmp_path)
     assert len(report.seen) >= 1

@@ -123,6 +123,7 @@ def swept():
     return env, results
 
 
+@pytest.mark.slow
 def test_one_program_serves_every_robot_and_controller(swept):
     assert Counted.built == 1
 
@@ -165,6 +166,7 @@ def swept_looks():
         ).run(params)
 
 
+@pytest.mark.slow
 def test_looks_are_swept_for_a_policy_that_sees(swept_looks):
     gain, exposure, delay = swept_looks
     assert [one.sweep.name for one in swept_looks] == ["motor_gain", "exposure", "camera_delay"]

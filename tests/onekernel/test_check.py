@@ -119,6 +119,7 @@ WRONG_KERNELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_round_off_is_allowed(name, monkeypatch):
     monkeypatch.setenv(fused.CHECK, "1")

@@ -160,6 +160,7 @@ STORED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STORED)
 def test_only_what_is_not_there_already_is_stored(name):
     function, shapes = STORED[name]

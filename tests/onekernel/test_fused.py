@@ -199,6 +199,7 @@ LONG_SCANS = {
 
 
 # Cumulative sums are in "rows that are results, too".
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_unless(lambda name: name != "cumulative sums", LONG_SCANS))
 def test_a_long_scan_is_one_kernel(name):
     function, *arguments = LONG_SCANS[name]
@@ -707,6 +708,7 @@ def driven(request, root):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.cpu
 def test_environments_draw_and_end_as_those_of_many_kernels(driven):
     _, ours, theirs = driven

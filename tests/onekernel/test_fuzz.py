@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helpers import call_frame, random_functions
+from helpers.further import slow_unless
 from helpers.run_program import evaluate
 from onekernel import cpu, fuse, gpu
 from onekernel.check import differ
@@ -16,7 +17,7 @@ from onekernel.round_off import noisy
 if cpu.obstacle():
     pytest.skip("llvmlite compiles nothing here", allow_module_level=True)
 
-QUICK = 11
+QUICK = 4
 BATCH = 24  # functions in one test of the slow suite
 BATCHES = 100
 REGRESSIONS = (33, 62, 110, 236, 689, 972)
@@ -174,7 +175,9 @@ def check(seed, monkeypatch, *, stages):
         raise AssertionError(f"seed {seed}: {error}\n{function.text}") from error
 
 
-@pytest.mark.parametrize("seed", [*range(QUICK), *REGRESSIONS])
+@pytest.mark.parametrize(
+    "seed", slow_unless(range(QUICK).__contains__, [*range(QUICK), *REGRESSIONS])
+)
 def test_a_function_is_what_jax_makes_of_it(seed, monkeypatch):
     check(seed, monkeypatch, stages=seed % STAGES == 0)
 

@@ -214,6 +214,7 @@ def driven_chain(links):
         return step, (qpos, qvel), jax.jit(jax.vmap(step))(qpos, qvel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("links", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_a_chain_of_hinges_moves_as_with_the_library(way, links):

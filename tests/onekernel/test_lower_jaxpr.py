@@ -672,6 +672,7 @@ def substep(env):
     return step, first, jaxpr.scalarize(step, first, jnp.zeros(2))
 
 
+@pytest.mark.slow
 def test_the_arithmetic_of_mjx_is_mjxs_own(substep):
     step, first, program = substep
     rng = np.random.default_rng(0)

@@ -71,6 +71,7 @@ def test_a_cart_moves_as_in_c(integrator, n_substeps):
     assert compared(model_of(CART_POLE, integrator), n_substeps=n_substeps)[0] < 1e-6
 
 
+@pytest.mark.slow
 def test_a_cart_moves_as_in_mjx():
     from_c, from_mjx = compared(model_of(CART_POLE, "implicitfast"), with_mjx=True)
     assert from_c < 1e-6
@@ -83,6 +84,7 @@ def test_a_leg_meets_the_floor_as_in_mjx():
     assert from_mjx < 1e-6
 
 
+@pytest.mark.slow
 def test_a_chain_of_fourteen_swings_as_in_c():
     # Its mass matrix is so badly conditioned that MJX in float32 is as far from C.
     assert compared(model_of(chain(14)))[0] < 1e-4
@@ -173,6 +175,7 @@ def test_a_step_is_one_kernel_also_inside_an_environment(falls):
         np.testing.assert_allclose(found, wanted, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_follows_from_a_state_is_computed_in_the_same_kernel():
     model = mujoco.MjModel.from_xml_string(SENSES)
     step = fuse_mjx(model, 2, on_unsupported="raise")

@@ -228,6 +228,7 @@ def test_what_a_cpu_finds_in_jax_s_cache_is_compiled_once_more_and_written(jax_c
         assert twice(found) == [0, 2, 4]
 
 
+@pytest.mark.slow
 def test_what_this_process_has_found_there_before_is_compiled_once_more(jax_cache, folder):
     tripled = jax.jit(lambda x: 3 * jnp.sin(x).at[1].set(x.sum()))
 
@@ -429,6 +430,7 @@ def test_a_training_from_kept_programs_is_the_same_to_the_bit(root, folder, monk
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_a_second_process_traces_nothing_and_trains_to_the_same_bits(root, tmp_path):
     cache = tmp_path / "cache"
     cache.mkdir()

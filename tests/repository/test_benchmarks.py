@@ -528,6 +528,7 @@ def test_mujocos_batch_and_rollout_start_from_the_same_states():
     assert np.ptp(ends[0][:, 0]) > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["small_solves", pytest.param("search", marks=pytest.mark.slow)])
 def test_a_program_is_the_same_as_one_kernel_and_by_xla(name, capsys, monkeypatch):
     monkeypatch.setattr(timing, "REPEAT_SECONDS", 0.01)
@@ -660,6 +661,7 @@ def test_an_ensemble_is_solved_alike_as_one_kernel_and_by_xla(tmp_path, monkeypa
         ensembles.main(["--tolerance", "0"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [pytest.param(None, marks=pytest.mark.slow), 0.2])
 def test_robots_are_compared_with_c_mujoco_under_the_same_commands(friction, monkeypatch):
     env = robot_fidelity.make_jetbot_env(load_config("turtlebot")).blind()

@@ -225,6 +225,7 @@ def test_the_site_builds_without_a_warning(site):
     assert "<code>eval/episodes  " in told.replace("<pre><span></span>", "")
 
 
+@pytest.mark.slow
 def test_the_site_has_its_pages_as_markdown_too(site):
     assert (site / "llms.txt").read_text("utf-8") == (DOCS / "llms.txt").read_text("utf-8")
     for page in ALL_PAGES.keys() - REFERENCE.keys():
@@ -636,6 +637,7 @@ def test_python_blocks_compile(page):
 RUNNABLE = [page for page in PAGES if "```python\n# runs\n" in PAGES[page]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RUNNABLE)
 def test_blocks_that_are_said_to_run_do(page, reader, monkeypatch, capsys):
     reader(page)

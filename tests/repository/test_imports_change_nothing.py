@@ -155,6 +155,7 @@ def after_others(others):
     return run(others, MODULES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "what",
     [

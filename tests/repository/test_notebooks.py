@@ -185,6 +185,7 @@ def test_environment_notebook_runs(execute):
     assert "20 different goals in 20 episodes" in text(notebook)
 
 
+@pytest.mark.slow
 def test_training_notebook_runs(trained):
     assert images(trained) == ["image/png"]
     assert "best policy" in text(trained)

@@ -49,6 +49,7 @@ def drives(env):
     return jax.device_get(jax.jit(jax.vmap(drive))(jnp.asarray(PLACES, jnp.float32)))
 
 
+@pytest.mark.slow
 def test_a_pillar_stops_the_robot_at_its_surface(drives, env):
     import pillars_task
 

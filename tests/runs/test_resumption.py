@@ -166,6 +166,7 @@ def test_a_state_is_read_back_whole(states, template):
     assert len({digest(state.optimizer_state) for state in states.values()}) == len(STEPS)
 
 
+@pytest.mark.slow
 def test_twice_as_long_is_resumed_half_way(smoke, tmp_path, same, capsys):
     run_dir = tmp_path / "run"
     arguments = ["--set", "ppo.num_timesteps=32768", "--run-dir", str(run_dir)]
@@ -679,6 +680,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", CHANGEABLE_ON_RESUME)
 def test_settings_that_may_change_on_resume_are_applied_and_stored(run_copy, key, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", FakeWandb())

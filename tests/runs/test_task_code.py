@@ -294,6 +294,7 @@ def test_dataclasses_with_annotations_as_text_work(tmp_path):
     assert stored_class(tmp_path, f"{NAME}:Task")(3).at == 3
 
 
+@pytest.mark.slow
 def test_a_run_is_whole_without_the_module_and_resumes_with_its_own_task(
     tmp_path, root, monkeypatch, capsys
 ):

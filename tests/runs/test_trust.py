@@ -283,6 +283,7 @@ def share(monkeypatch):
         yield share
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("attack", "command"),
     [

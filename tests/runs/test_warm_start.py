@@ -127,6 +127,7 @@ def test_the_exploration_noise_is_reset_and_the_mean_action_kept(source):
     np.testing.assert_array_equal(last[:, 2:], new[:, 2:])
 
 
+@pytest.mark.slow
 @gliding.everywhere()
 def test_a_normal_distribution_starts_from_a_policy_too(tmp_path):
     network = {"network": {"distribution_type": "normal", "policy_hidden_layer_sizes": [16]}}
@@ -151,6 +152,7 @@ def test_a_normal_distribution_starts_from_a_policy_too(tmp_path):
     assert not matched["hidden_0"]["kernel"][0].any()
 
 
+@pytest.mark.slow
 def test_choices_of_an_environment_begin_with_those_of_a_policy(tmp_path):
     session.run(point_mass.config("Choosing"), tmp_path / "source")
     changes = {"seed": 1, "init_from": str(tmp_path / "source")}

@@ -84,6 +84,7 @@ def python(*arguments, plain="1", **environment):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("plain", "changed"), [("1", 0), ("0", 7), ("", 7)])
 def test_a_plain_start_leaves_the_process_as_it_is(tmp_path, plain, changed):
     (tmp_path / "program.py").write_text(PROCESS, "utf-8")

@@ -90,6 +90,7 @@ def test_an_interrupted_training_ends_with_the_same_bits(run, config_file):
     assert sums(run) != sums(run, STEP)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_tells_what_of_the_training_was_slow(run):
     told = read_about(checkpoint_path(run, 3 * STEP))["fallbacks"]
     assert told == [["ppo.update", "it takes observations without images"]]
@@ -120,6 +121,7 @@ def test_a_policy_takes_what_it_was_trained_on_and_nothing_else(run):
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_a_policy_is_evaluated_in_its_environment(run, capsys):
     checkpoint = load_checkpoint(run, "last")
@@ -189,6 +191,7 @@ def test_images_too_small_for_the_network_are_refused_before_a_run_begins(config
     assert not run_dir.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("randomization", [{}, {"start_x": [0.0, 0.1]}])
 def test_a_nan_dump_with_images_is_replayed(tmp_path, randomization):
     config = parse_config(SETTINGS | {"randomization": randomization})

@@ -129,6 +129,7 @@ def finished(stopped, unused_port):
     return [Ended(process) for process in begun], run_dir
 
 
+@pytest.mark.slow
 def test_a_signal_to_one_stops_all_at_the_same_step(stopped):
     (first, second), _, saved = stopped
     assert [first.code, second.code] == [STOPPED, STOPPED], first.err + second.err

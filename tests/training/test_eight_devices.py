@@ -57,6 +57,7 @@ def told(on_one):
 TELLER = f"{gliding.LAZILY}; from helpers import eight_devices; eight_devices.main()"
 
 
+@pytest.mark.slow
 def test_every_device_draws_robots_and_noise_of_its_own(told):
     robots = told["robots"]
     envs = load_config(SMOKE).ppo.num_envs
@@ -113,6 +114,7 @@ def test_a_run_of_one_device_resumes_on_eight(told, on_one):
     assert [line["env_steps"] for line in lines(on_one)] == [0, SIZE, 2 * SIZE]
 
 
+@pytest.mark.slow
 def test_a_run_of_eight_devices_resumes_on_one(told, on_one):
     run_dir = on_one.with_name("eight")
     for stored, found in restored(run_dir).values():

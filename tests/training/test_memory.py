@@ -35,6 +35,7 @@ MANY = ["ppo.num_envs=2048", "ppo.num_minibatches=32", "ppo.unroll_length=4"]
 
 
 # For so small a training the XLA of a GPU sets aside from half to nine eighths of what is told.
+@pytest.mark.slow
 @pytest.mark.cpu
 @pytest.mark.parametrize(
     ("settings", "fullest"),
@@ -132,6 +133,7 @@ def test_a_cpu_has_the_memory_of_its_machine():
     assert 0.1 * GIB < memory.device_memory() < 2**50
 
 
+@pytest.mark.slow
 def test_out_of_memory_the_next_size_that_fits_is_named(config, tmp_path, monkeypatch):
     def train_too_large(*arguments, **options):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory\nallocating")

@@ -142,6 +142,7 @@ def test_before_there_is_a_folder_the_signal_ends_the_process(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_compiling_before_the_first_checkpoint_it_does_not_wait_for_the_compiler(tmp_path):
     with training(tmp_path / "run", f"dwell(Evaluator, 'run', {LONG})") as process:
         process.until(lambda: "now: run\n" in process.stdout)
@@ -163,6 +164,7 @@ def test_compiling_after_a_checkpoint_it_does_not_wait_for_the_compiler(begun):
     assert checkpoint_steps(begun) == [0, INTERVAL]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
 )
@@ -175,6 +177,7 @@ def test_between_two_reports_it_saves_where_it_is_and_goes_on(number, begun, und
         assert torture.differences(undisturbed, finish(begun)) == []
 
 
+@pytest.mark.slow
 def test_while_evaluating_it_finishes_that_and_saves(begun):
     with training(begun, "dwell(Evaluator, 'run', 1)") as process:
         code = stop(process, "run")
@@ -191,6 +194,7 @@ def test_while_saving_it_finishes_that(begun):
     assert 2 * INTERVAL in checkpoint_steps(begun)
 
 
+@pytest.mark.slow
 def test_a_save_longer_than_the_notice_is_aborted(begun):
     notice = 10
     with training(begun, f"dwell(Evaluator, 'run', {LONG})", notice=notice) as process:
@@ -222,6 +226,7 @@ def unread(run_dir, program):
     return process
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_without_a_reader(begun, undisturbed):
     with unread(begun, TRAINER) as process:
         assert process.wait(PATIENCE) == 0

@@ -3,6 +3,8 @@
 import re
 import statistics
 
+import pytest
+
 from helpers import point_mass
 from jetbot_mjx.config import load_config
 from jetbot_mjx.tuning.results import entrants_table, run_search
@@ -26,6 +28,7 @@ def test_values_in_the_table_can_be_copied_into_a_configuration():
     )
 
 
+@pytest.mark.slow
 def test_a_search_in_an_environment_maximises_the_return(tmp_path):
     config = point_mass.config()
     space = read_space({"ppo.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True}}, config)
@@ -45,6 +48,7 @@ def test_a_search_in_an_environment_maximises_the_return(tmp_path):
     assert load_config(folder / "best.yaml").environment == config.environment
 
 
+@pytest.mark.slow
 def test_where_an_environment_tells_successes_they_are_the_score():
     config = point_mass.config(environment_options={"succeeds": True})
     (outcome,) = Trials(config, (), evaluations=2).run([{}], [0])

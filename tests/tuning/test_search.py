@@ -364,6 +364,7 @@ def test_every_phase_is_a_stage_that_a_command_shows(tmp_path):
         assert shown == ["plots"]
 
 
+@pytest.mark.slow
 def test_results_are_written(tmp_path):
     folder = tmp_path / "s"
     one = search.Search(CONFIG, SPACE, folder)

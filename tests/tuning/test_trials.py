@@ -104,6 +104,7 @@ def test_compiling_and_training_are_stages_that_a_command_shows(trials):
     assert shown == ["compiling the training of 4 policies", "intervals of training 3 policies"]
 
 
+@pytest.mark.slow
 def test_trials_begin_with_another_policy(trials, tmp_path):
     from jetbot_mjx.runs.checkpoint import load_checkpoint
     from jetbot_mjx.training import session

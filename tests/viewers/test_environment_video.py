@@ -20,6 +20,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_episodes_are_rendered_in_real_time(folder, with_opengl):
     rendered = library.render(folder, episodes=1, size=(160, 96))
     assert {name: path.name for name, path in rendered.files.items()} == {
@@ -36,6 +37,7 @@ def test_episodes_are_rendered_in_real_time(folder, with_opengl):
     assert ((red[..., 0] > 120) & (red[..., 1] < 70) & (red[..., 2] < 70)).sum() > 20
 
 
+@pytest.mark.slow
 def test_a_training_renders_its_policies(tmp_path, with_opengl):
     config = point_mass.config("Shown", evaluation={"episodes": 4, "video": "last"})
     training.run(config, tmp_path / "run")

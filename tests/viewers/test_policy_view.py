@@ -81,6 +81,7 @@ def player():
     return player
 
 
+@pytest.mark.slow
 def test_a_player_shows_the_newest_image_of_the_chosen_robot(player):
     images = []
     for player.robot in (0, 1):
@@ -98,6 +99,7 @@ def test_a_player_shows_the_newest_image_of_the_chosen_robot(player):
     assert player.sees
 
 
+@pytest.mark.slow
 def test_a_player_maps_what_the_policy_looks_at_for_the_chosen_robot(player):
     networks = make_networks(player.env.config.ppo, player.env.observation_size, 2)
     policy = make_policy(networks, player._params)

@@ -396,6 +396,7 @@ def assert_in_view(client, *places_w):
         assert 10 < row < 710, place_w
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "goal", [(0.2, 0.1), (1.1, -0.5), (-1.1, 0.2), (0.0, 1.2), (2.0, -2.5), (-0.8, -0.9)]
 )

@@ -68,6 +68,7 @@ def drawn(ranges):
     return episodes(make_config(ranges.model_dump()), ENVS, EPISODES * LENGTH)
 
 
+@pytest.mark.slow
 def test_each_look_is_constant_in_an_episode_and_another_one_in_each(drawn, ranges):
     camera = drawn.episode_params.camera
     whole = {"floor_texture", "clutter", "camera_delay", "camera_interval"}

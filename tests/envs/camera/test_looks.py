@@ -368,6 +368,7 @@ def test_objects_stand_around_and_look_like_no_goal(eye, plain):
     assert np.linalg.norm(places - CUBE[:2], axis=-1).min() >= 0.25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "camera",
     [

@@ -43,6 +43,7 @@ def images(camera, env, goals=GOALS):
     return np.asarray(jax.jit(jax.vmap(lambda goal: camera.render(pose, {"goal": goal})))(goals))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lens",
     [
@@ -65,6 +66,7 @@ def test_the_pictures_look_in_the_directions_of_training(lens, env, with_opengl)
         assert moved > 1.6 * apart, shift
 
 
+@pytest.mark.slow
 def test_every_robot_sees_a_scenery_of_its_own_and_always_the_same(env, with_opengl):
     config = CameraConfig(width=16, height=16)
     goals = np.tile(GOALS[:1], (SCENERIES + 1, 1))
@@ -165,6 +167,7 @@ camera.picture(np.array([0, 0, 0.03]), np.array([1.0, 0, 0, 0]), {"goal": np.arr
 """
 
 
+@pytest.mark.slow
 def test_a_program_that_has_drawn_ends_without_a_word(root, with_opengl):
     done = subprocess.run(
         [sys.executable, "-c", ONE_PICTURE], cwd=root, capture_output=True, text=True

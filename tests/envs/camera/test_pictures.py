@@ -162,6 +162,7 @@ def _range_around(images, reach):
     return windows.min((-1, -2)).astype(int), windows.max((-1, -2)).astype(int)
 
 
+@pytest.mark.slow
 def test_outlines_are_mujocos_to_one_pixel(beside):
     for ours, mujocos in zip(beside.ids, beside.mj_ids, strict=True):
         for geom in np.unique(mujocos):
