@@ -134,7 +134,7 @@ class Condensed(struct.PyTreeNode):
 
 
 def condense(tree: PyTree, most: int = 16) -> Condensed:
-    """Pack the small arrays of a tree, at least one.
+    """Pack the small arrays of a tree, if there are any.
 
     Args:
       tree: the arrays.

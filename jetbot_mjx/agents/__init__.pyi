@@ -15,7 +15,7 @@ from .networks import last_layer as last_layer
 from .networks import make_networks as make_networks
 from .networks import make_policy as make_policy
 from .ppo import PPO as PPO
-from .random_keys import by_kernel as by_kernel
+from .random_keys import kernel_key as kernel_key
 from .random_keys import raw_key as raw_key
 from .train_state import LOSSES as LOSSES
 from .train_state import TALLIED as TALLIED

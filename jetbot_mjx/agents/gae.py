@@ -7,12 +7,14 @@ Unrolled, the same operations in the same order are one or two kernels.
 Equation, backwards in time, with dₜ = 1 if the task terminated the episode at step t and cₜ = 1 if
 the time limit truncated it:
 
-    δₜ = (1 - cₜ) (rₜ + γ (1 - dₜ) Vₜ₊₁ - Vₜ)
-    Aₜ = δₜ + γ λ (1 - dₜ) (1 - cₜ) Aₜ₊₁
+    δₜ  = (1 - cₜ) (rₜ + γ (1 - dₜ) Vₜ₊₁ - Vₜ)
+    Aₜ  = δₜ + γ λ (1 - dₜ) (1 - cₜ) Aₜ₊₁
+    V'ₜ = Vₜ + Aₜ
+    Âₜ  = (1 - cₜ) (rₜ + γ (1 - dₜ) V'ₜ₊₁ - Vₜ) = δₜ + γ (1 - dₜ) (1 - cₜ) Aₜ₊₁
 
 A termination stops bootstrapping from Vₜ₊₁, but a truncation does not end the task: Vₜ₊₁ already
-belongs to the next episode, so the truncated step has no advantage at all. The value targets are
-Vₜ' = Aₜ + Vₜ, and the advantages of Brax's loss are the δₜ that has Vₜ₊₁' in the place of Vₜ₊₁.
+belongs to the next episode, so the truncated step has no advantage at all. V'ₜ is the value target.
+The advantage of Brax's loss is Âₜ: it is Aₜ without the first of its factors λ.
 
 `td_error` and `gae_step` are these equations; `fused.sample_loss` lowers them for the kernels.
 
@@ -31,13 +33,13 @@ _MAX_UNROLL_LENGTH = 64
 def td_error(
     reward: Array, discount: Array, value: Array, next_value: Array, not_truncated: Array
 ) -> Array:
-    """Return δₜ, the error of the value estimate of one step, or of many.
+    """Return δₜ, the error of the value estimate of one step, or of many; or Âₜ.
 
     Args:
       reward: rₜ, scaled as in the loss.
       discount: γ (1 - dₜ).
       value: Vₜ.
-      next_value: Vₜ₊₁.
+      next_value: Vₜ₊₁ for δₜ, V'ₜ₊₁ for Âₜ.
       not_truncated: 1 - cₜ.
     """
     return (reward + discount * next_value - value) * not_truncated
@@ -63,7 +65,7 @@ def compute_gae(
     lambda_: float = 1.0,
     discount: float = 0.99,
 ) -> tuple[Float[Array, "time batch"], Float[Array, "time batch"]]:
-    """Compute the value targets and the advantages by the equation that the module states.
+    """Compute the value targets and the advantages by the equations that the module states.
 
     Args:
       truncation: cₜ, 1 at steps where the time limit truncated an episode.
@@ -75,8 +77,7 @@ def compute_gae(
       discount: γ, the discount per environment step.
 
     Returns:
-      The targets Vₜ' = Aₜ + Vₜ, and the advantages that Brax's loss uses,
-      (1 - cₜ) (rₜ + γ (1 - dₜ) Vₜ₊₁' - Vₜ). No gradient passes through either.
+      The value targets V'ₜ and the advantages Âₜ. No gradient passes through either.
     """
     if len(rewards) > _MAX_UNROLL_LENGTH:
         # Late: Brax imports MJX, and few trainings need this.
@@ -91,7 +92,7 @@ def compute_gae(
     next_values = jnp.concatenate([values[1:], bootstrap_value[None]])
     deltas = td_error(rewards, discounts, values, next_values, not_truncated)
     factors = discounts * not_truncated * lambda_
-    # Accumulate Aₜ backwards in time, which gives the targets and from them the advantages.
+    # Accumulate Aₜ backwards in time, which gives the targets V'ₜ and from them Âₜ.
     gae = [deltas[-1]]
     for delta, factor in zip(deltas[-2::-1], factors[-2::-1], strict=True):
         gae.append(gae_step(delta, factor, gae[-1]))

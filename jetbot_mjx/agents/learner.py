@@ -1,7 +1,16 @@
 """State what `PPO` needs of a learner: actions for a collection, and an update of the networks.
 
 `PPO` is the same algorithm whoever computes it. A learner says how: XLA from JAX's functions
-(`xla_learner`), or kernels of this package (`fused`).
+(`xla_learner`), or kernels of this package (`fused.learner`).
+
+Parameters and Adam's moments have three forms:
+
+    saved     trees, in `PPO.init` and in checkpoints
+    packed    between two calls of `PPO.advance`: what `Learner.layout` makes of the trees
+    working   during a call: what `Learner.update` takes and returns
+
+For an `XlaLearner` all three are trees, and for a `FusedLearner`, packed and working are vectors.
+Packed vectors and working trees occur where an `XlaLearner` stands in for a `FusedLearner`.
 """
 
 from collections.abc import Callable
@@ -14,7 +23,7 @@ from jetbot_mjx.agents.brax_parts import Normalizer, Transition
 from jetbot_mjx.agents.train_state import TrainState
 from jetbot_mjx.packed import Packed
 
-Unroll = Callable[[Packed, PRNGKeyArray], tuple[Packed, Transition]]
+UnrollFn = Callable[[Packed, PRNGKeyArray], tuple[Packed, Transition]]
 """Steps the environments with actions of the policy: from their states and a random key to the
 states after the last step, and the data of all steps, of shape (time, environments, ...)."""
 
@@ -46,17 +55,17 @@ ONE_DEVICE = DeviceAxis()
 
 
 class Layout:
-    """A `Layout` is the form of parameters and moments between two calls of `PPO.advance`.
+    """A `Layout` converts parameters and moments between the saved and the packed form.
 
     This one leaves them as the trees that they are.
     """
 
     def pack(self, tree: PyTree) -> PyTree:
-        """Return a tree of parameters and moments in this form, on host or device."""
+        """Return the packed form of a tree of parameters and moments, on host or device."""
         return tree
 
     def unpack(self, tree: PyTree) -> PyTree:
-        """Return the tree, the inverse of `pack`."""
+        """Return the saved form, the inverse of `pack`."""
         return tree
 
 
@@ -78,16 +87,18 @@ class PackedEnv(Protocol):
 class Learner(Protocol):
     """A `Learner` computes the actions of a collection and the update of the networks.
 
-    The order of the calls: `obstacle` and `prepare` before `PPO.advance` is traced; `begin` at its
-    start; `unroll` and `update` in each training step; `end` at its end. While XLA compiles,
-    `failure` checks the kernels. No call changes the learner.
+    The order of the calls: `obstacle` and `prepare` before `PPO.advance` is traced; `to_working` at
+    its start; `make_unroll` and `update` in each training step; `from_working` at its end. While
+    XLA compiles, `failure` checks the kernels. No call changes the learner.
     """
 
     # What others ask of it without knowing which it is.
     name: str
     """The value of `ppo.update` that asks for this learner."""
     layout: Layout
-    """The form of parameters and moments between two calls of `PPO.advance`."""
+    """The packed form of parameters and moments."""
+
+    # For the estimate of `training.memory`; the algorithm does not read them.
     keeps_activations: bool
     """Whether a gradient passes the activations of a minibatch through memory."""
     draws_ahead: bool
@@ -108,20 +119,20 @@ class Learner(Protocol):
 
     # Inside the program: once around all steps, and in each step.
 
-    def begin(self, tree: PyTree) -> PyTree:
-        """Return parameters and optimizer state as `update` takes them, from `layout.pack`."""
+    def to_working(self, tree: PyTree) -> PyTree:
+        """Return the working form of packed parameters and optimizer state."""
         return tree
 
-    def end(self, tree: PyTree) -> PyTree:
-        """Return parameters and optimizer state in the layout, the inverse of `begin`."""
+    def from_working(self, tree: PyTree) -> PyTree:
+        """Return the packed form, the inverse of `to_working`."""
         return tree
 
-    def unroll(self, env: PackedEnv, state: TrainState) -> Unroll:
+    def make_unroll(self, env: PackedEnv, state: TrainState) -> UnrollFn:
         """Return the function that collects unrolls with the policy of a state.
 
         Args:
           env: the environment.
-          state: the packed state, with parameters from `begin`.
+          state: the packed state, with parameters in the working form.
         """
         ...
 
@@ -136,10 +147,11 @@ class Learner(Protocol):
         """Update the networks in several passes over the collected data, in minibatches.
 
         Args:
-          params: the parameters, from `begin`.
-          optimizer_state: the state of the optimizer, from `begin`.
+          params: the parameters, in the working form.
+          optimizer_state: the state of the optimizer, in the working form.
           normalizer: the statistics that normalise the observations.
-          data: the unrolls, of shape (unrolls, time, ...); of the last steps `next_observation`.
+          data: the unrolls, of shape (unrolls, time, ...); `next_observation` only of each
+            unroll's last step.
           key: the random key of the shuffles and of the samples that estimate the entropy.
 
         Returns:

@@ -1,5 +1,8 @@
 """Compute PPO's loss of a minibatch, whose equation `jetbot_mjx.agents.ppo` states.
 
+`XlaLearner` differentiates it. `FusedLearner` does not call it: `fused.sample_loss` states the same
+loss of one sample for the kernels. Whoever changes one changes both.
+
 Formulas and the order of operations are those of Brax; only the advantages are computed by `gae`,
 without a loop.
 

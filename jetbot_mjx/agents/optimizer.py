@@ -62,9 +62,9 @@ class AdamState(NamedTuple):
     count: Int[Array, ""]
     """The number of steps so far."""
     mu: PyTree
-    """Mean of the gradients."""
+    """First moment: the moving average of the gradients."""
     nu: PyTree
-    """Mean of their squares."""
+    """Second moment: the moving average of their squares."""
 
 
 def read_adam(state: PyTree) -> AdamState:
@@ -82,8 +82,8 @@ def write_adam(
       state: the state before them.
       rate: the step size of the last one.
       applied: their number.
-      mu: mean of the gradients after them.
-      nu: mean of their squares.
+      mu: the first moment after them.
+      nu: the second moment after them.
     """
     *before, injected = state
     adam, *rest = injected.inner_state

@@ -8,25 +8,29 @@ Equation: each minibatch minimises Brax's loss, the sum of the clipped surrogate
 value loss and the entropy bonus:
 
     L = L_policy + L_value + L_entropy
-    L_policy  = -mean(min(ρ A, clip(ρ, 1 - ε, 1 + ε) A)),  ρ = π(a|s) / π_old(a|s)
-    L_value   = ½ c_v mean((V_target - V)²)
+    L_policy  = -mean(min(ρ Â, clip(ρ, 1 - ε, 1 + ε) Â)),  ρ = π(a|s) / π_old(a|s)
+    L_value   = ½ c_v mean((V' - V)²)
     L_entropy = -c_e mean(H)
 
-A and V_target come from `gae`, H is the entropy of the policy, ε = `clipping_epsilon`,
-c_v = `vf_loss_coefficient` and c_e = `entropy_cost`. With `normalize_advantage`, A is normalised
-over the minibatch.
+The advantage Â and the value target V' come from `gae`, H is the entropy of the policy,
+ε = `clipping_epsilon`, c_v = `vf_loss_coefficient` and c_e = `entropy_cost`. With
+`normalize_advantage`, Â is normalised over the minibatch; each of several devices normalises its
+share.
 
 Protocol of a training step:
 
 1. `collect` runs the current policy for `unroll_length` steps in every environment, until there are
    `batch_size * num_minibatches` unrolls.
 2. The normaliser takes in all collected observations.
-3. `update` makes `num_updates_per_batch` passes over the unrolls. Each pass shuffles them, splits
-   them into `num_minibatches`, and for each minibatch computes the values, the advantages, the loss
-   and its gradient, and applies one step of Adam.
+3. `Learner.update` makes `num_updates_per_batch` passes over the unrolls. Each pass shuffles them,
+   splits them into `num_minibatches`, and for each minibatch computes the values, the advantages,
+   the loss and its gradient, clips it to the global norm `max_grad_norm`, and applies one step of
+   Adam.
 
-Who computes actions and update is a `Learner`: `XlaLearner` is the algorithm in JAX's functions,
-and the kernels that docs/kernels.md explains do the same faster.
+A `Learner` computes actions and update. `XlaLearner` (`xla_learner`, with the loss in `loss`) is
+the readable reference in JAX's functions. `FusedLearner` (`fused.learner`, with the same loss of
+one sample in `fused.sample_loss`) does the same faster by the kernels that docs/kernels.md
+explains; `ppo.update: auto`, the default, chooses it where it can run.
 
 Networks, action distribution, running statistics, steps, gradients and the ADAPTIVE_KL rule
 are Brax's. On one device and with `normalizer: brax` and `update: xla`, the order of the random
@@ -34,11 +38,11 @@ keys is Brax's too, and every step equals a step of `brax.training.agents.ppo.tr
 from Brax are:
 
 - An update with a non-finite gradient is skipped and counted.
-- The first non-finite environment state is returned as a `NanDump`.
+- What reproduces the first non-finite state of an environment is returned as a `NanDump`.
 - `normalizer: physical` bounds the standard deviation from below by the observation's scale.
 - `learning_rate_schedule: LINEAR` lowers the step size to zero over the training.
-- These kernels compute the same loss, on GPUs with products of float16, and draw shuffles and
-  noise with other keys, many at once.
+- `FusedLearner` multiplies in float16 on GPUs, and draws shuffles and noise with other keys, many
+  at once.
 - GAE is unrolled, and of the next observations only those that the loss needs are stored.
 
 The step is written for one shard of the environments. Under `jax.shard_map` over a `DeviceAxis`
@@ -57,8 +61,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt32
 
 from jetbot_mjx.agents.brax_parts import Env, Normalizer, Transition, UInt64
+from jetbot_mjx.agents.choose_learner import choose_learner, xla_instead
 from jetbot_mjx.agents.learner import ONE_DEVICE, DeviceAxis, Learner
-from jetbot_mjx.agents.learners import choose_learner, xla_instead
 from jetbot_mjx.agents.networks import (
     NetworkParams,
     Networks,
@@ -66,7 +70,7 @@ from jetbot_mjx.agents.networks import (
     update_normalizer,
 )
 from jetbot_mjx.agents.optimizer import make_optimizer
-from jetbot_mjx.agents.random_keys import by_kernel, raw_key
+from jetbot_mjx.agents.random_keys import kernel_key, raw_key
 from jetbot_mjx.agents.train_state import EPISODE_SUMS, TALLIED, NanDump, TrainState
 from jetbot_mjx.agents.unrolls import find_nan_dump, joined
 from jetbot_mjx.config import PPOConfig
@@ -151,7 +155,7 @@ class PPO:
           The state with all environments, so this must be called outside `jax.shard_map`.
         """
         # Split the keys in the order of Brax's train(), up to the first epoch.
-        global_key, local_key = jax.random.split(by_kernel(key))
+        global_key, local_key = jax.random.split(kernel_key(key))
         local_key = jax.random.fold_in(local_key, 0)
         local_key, env_key, _ = jax.random.split(local_key, 3)
         policy_key, value_key = jax.random.split(global_key)
@@ -187,8 +191,8 @@ class PPO:
           The packed state after the last step, and the shard's first `NanDump` of these steps.
         """
         tally = jnp.where(restart, 0.0, state.tally)
-        # Take parameters and moments as the learner computes with them.
-        state = _with_learned(state.replace(tally=tally), self.learner.begin)
+        # Convert parameters and moments to the form that the learner computes with.
+        state = _map_learned(self.learner.to_working, state.replace(tally=tally))
 
         def body(_: Array, carry: tuple[TrainState, NanDump]) -> tuple[TrainState, NanDump]:
             before, nan_dump = carry
@@ -206,21 +210,21 @@ class PPO:
             step=jnp.zeros((), jnp.int32),
         )
         state, nan_dump = jax.lax.fori_loop(0, num_steps, body, (state, none))
-        return _with_learned(state, self.learner.end), nan_dump
+        return _map_learned(self.learner.from_working, state), nan_dump
 
     def packed(self, state: TrainState) -> TrainState:
-        """Return a state with few arrays, as `advance` takes it.
+        """Return a state with few arrays, as `advance` takes it; see the forms in `learner`.
 
         Args:
           state: the state, from `init` or on the host.
         """
         state = state.replace(env_state=pack(state.env_state, batch_axes=1))
-        return _with_learned(state, self.learner.layout.pack)
+        return _map_learned(self.learner.layout.pack, state)
 
     def unpacked(self, state: TrainState) -> TrainState:
         """Return a state with all arrays, the inverse of `packed`."""
         state = state.replace(env_state=state.env_state.unpack())
-        return _with_learned(state, self.learner.layout.unpack)
+        return _map_learned(self.learner.layout.unpack, state)
 
     # The algorithm.
 
@@ -228,14 +232,14 @@ class PPO:
         """Collect experience with the current policy, and update the policy with it.
 
         Args:
-          state: the packed state of this shard, with parameters and moments from `Learner.begin`.
+          state: the packed state of this shard, with parameters and moments in the working form.
 
         Returns:
-          The next state; the metrics of `TALLIED`, which are means over the minibatches and sums
-          over the episodes that ended during collection; and the first non-finite state.
+          The next state; the metrics of `TALLIED`; and what reproduces the first non-finite state.
         """
-        # Each device draws its own keys, and all devices continue from the same one.
-        update_key, rollout_key, next_key = jax.random.split(by_kernel(state.key), 3)
+        # Each device draws its own keys, and all devices continue from the same one. On CPUs,
+        # kernels draw from these keys, with the numbers that JAX would draw.
+        update_key, rollout_key, next_key = jax.random.split(kernel_key(state.key), 3)
         update_key = self._devices.own_key(update_key)
         rollout_key = self._devices.own_key(rollout_key)
         # 1. Collect experience with the current policy.
@@ -248,8 +252,8 @@ class PPO:
         # normaliser: it compares the new action distributions with those of the collection.
         adaptive = self.config.learning_rate_schedule == "ADAPTIVE_KL"
         normalizer = state.normalizer if adaptive else updated_normalizer
-        params, optimizer_state, metrics = self.update(
-            state.params, state.optimizer_state, normalizer, data, update_key
+        params, optimizer_state, totals = self.learner.update(
+            state.params, state.optimizer_state, normalizer, _without_statistics(data), update_key
         )
         # Go on from the next key, and report what happened.
         state = state.replace(
@@ -260,7 +264,7 @@ class PPO:
             key=raw_key(next_key),
             env_steps=state.env_steps + self.config.steps_per_training_step,
         )
-        return state, jnp.concatenate([jnp.ones(1), metrics, self._episode_sums(data)]), nan_dump
+        return state, self._metrics(totals, data), nan_dump
 
     def collect(self, state: TrainState, key: PRNGKeyArray) -> tuple[Packed, Transition, NanDump]:
         """Collect unrolls until there are enough for all minibatches.
@@ -271,58 +275,29 @@ class PPO:
 
         Returns:
           The environment states after the last unroll; the unrolls, of shape (unrolls, time, ...),
-          with `next_observation` of their last step only; and the first non-finite state.
+          with `next_observation` of their last step only; and what reproduces the first
+          non-finite state.
         """
-        make_steps = self.learner.unroll(self._env, state)
+        unroll = self.learner.make_unroll(self._env, state)
 
-        def unroll(
+        def next_unroll(
             carry: tuple[Packed, PRNGKeyArray], _: None
         ) -> tuple[tuple[Packed, PRNGKeyArray], tuple[Transition, NanDump]]:
             """Let the policy act for `unroll_length` steps in every environment."""
             start, key = carry
             key, next_key = jax.random.split(key)
-            after, data = make_steps(start, key)
+            after, data = unroll(start, key)
             nan_dump = find_nan_dump(start, data)
             ends = jax.tree.map(lambda x: x[None], after.unpack().obs)
             return (after, next_key), (data._replace(next_observation=ends), nan_dump)
 
-        # Run the unrolls one after the other, and return the first non-finite state of all.
+        # Run the unrolls one after the other, and keep the first dump.
         count = self.config.batch_size * self.config.num_minibatches // self.config.num_envs
         (env_state, _), (data, nan_dumps) = jax.lax.scan(
-            unroll, (state.env_state, key), length=count
+            next_unroll, (state.env_state, key), length=count
         )
         nan_dump = jax.tree.map(lambda x: x[jnp.argmax(nan_dumps.found)], nan_dumps)
         return env_state, joined(data), nan_dump
-
-    def update(
-        self,
-        params: PyTree,
-        optimizer_state: PyTree,
-        normalizer: Normalizer,
-        data: Transition,
-        key: PRNGKeyArray,
-    ) -> tuple[PyTree, PyTree, Float[Array, " metrics"]]:
-        """Let the learner update the networks, and average its metrics.
-
-        Each minibatch applies one step of Adam along the gradient of the loss L that the module
-        states, clipped to the global norm `max_grad_norm`. The arguments are those of
-        `Learner.update`.
-
-        Returns:
-          The new parameters, the new optimizer state, and the mean metrics of `LOSSES` over the
-          minibatches whose gradient was finite, followed by the number of the others.
-        """
-        # Drop the episode statistics, which need not be shuffled.
-        extras = {
-            "policy_extras": data.extras["policy_extras"],
-            "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
-        }
-        data = data._replace(extras=extras)
-        # Shuffle, split into minibatches, and learn from each: see `XlaLearner.update`.
-        params, optimizer_state, totals = self.learner.update(
-            params, optimizer_state, normalizer, data, key
-        )
-        return params, optimizer_state, self._mean_metrics(totals)
 
     # The normaliser and the metrics.
 
@@ -338,27 +313,38 @@ class PPO:
         raised: PyTree = normalizer
         return raised.replace(std=jax.tree.map(jnp.maximum, raised.std, self._min_std))
 
-    def _mean_metrics(self, totals: Float[Array, " metrics"]) -> Float[Array, " metrics"]:
-        """Average the metrics over the applied updates of all devices, and count the others.
+    def _metrics(
+        self, totals: Float[Array, " totals"], data: Transition
+    ) -> Float[Array, " metrics"]:
+        """Return the metrics of a training step over all devices, in the order of `TALLIED`.
 
         Args:
-          totals: the sums of the metrics of the applied updates, followed by their number.
+          totals: the sums of the metrics of the applied updates and their number, from
+            `Learner.update`.
+          data: what was collected.
         """
+        # One training step, what the applied updates add up to, and the number of the others.
         totals = self._devices.mean(totals)
-        means = totals[:-1] / jnp.maximum(totals[-1], 1.0)
-        updates = self.config.num_updates_per_batch * self.config.num_minibatches
-        return jnp.append(means, updates - totals[-1])
-
-    def _episode_sums(self, data: Transition) -> Float[Array, " sums"]:
-        """Sum the metrics of the episodes that ended during collection over all devices."""
+        skipped = self.config.updates_per_training_step - totals[-1:]
+        # The number and the sums of the episodes that ended during collection.
         ended = data.extras["state_extras"]["episode_done"]
         statistics: PyTree = data.extras["state_extras"]["episode_metrics"]
         terms = [ended]
         terms += [ended * statistics.get(name, jnp.zeros(())) for name in EPISODE_SUMS]
-        return self._devices.sum(jnp.stack(terms).sum(axis=(1, 2)))
+        episodes = self._devices.sum(jnp.stack(terms).sum(axis=(1, 2)))
+        return jnp.concatenate([jnp.ones(1), totals[:-1], skipped, episodes])
 
 
-def _with_learned(state: TrainState, change: Callable[[PyTree], PyTree]) -> TrainState:
-    """Return a state with other forms of its parameters and of the optimizer's state."""
+def _without_statistics(data: Transition) -> Transition:
+    """Return collected data without the statistics of episodes, which need not be shuffled."""
+    extras = {
+        "policy_extras": data.extras["policy_extras"],
+        "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
+    }
+    return data._replace(extras=extras)
+
+
+def _map_learned(change: Callable[[PyTree], PyTree], state: TrainState) -> TrainState:
+    """Return a state with another form of its parameters and of the optimizer's state."""
     params, optimizer_state = change((state.params, state.optimizer_state))
     return state.replace(params=params, optimizer_state=optimizer_state)

@@ -4,7 +4,7 @@ Motivation: XLA compiles a draw of random bits for a CPU to a loop of fourteen k
 bits it draws, and a training draws in a dozen places. Together they take a third of the time in
 which XLA compiles a training step.
 
-A key from `by_kernel` belongs to a generator of random numbers of its own (JAX's
+A key from `kernel_key` belongs to a generator of random numbers of its own (JAX's
 `define_prng_impl`), whose numbers are Threefry's. Functions of `jax.random` take such a key; what
 is stored is `raw_key`.
 """
@@ -29,8 +29,8 @@ _MOST_AT_ONCE = 16
 """Largest number of hashes that one kernel computes of a key; more are divided among threads."""
 
 
-def by_kernel(key: UInt32[Array, "2"]) -> PRNGKeyArray:
-    """Return a key that draws the same numbers by kernels, or the key itself.
+def kernel_key(key: UInt32[Array, "2"]) -> PRNGKeyArray:
+    """Return the key that draws the same numbers by kernels; the key itself without kernels.
 
     A GPU's programs draw as JAX does it, and so do those of a CPU for which there are no kernels.
 

@@ -36,7 +36,8 @@ TALLIED = (
     "rollout/episodes",
     *EPISODE_SUMS.values(),
 )
-"""Names of the metrics in `TrainState.tally`."""
+"""Names of the metrics in `TrainState.tally`: those of `LOSSES` are sums over the updates that were
+applied, `nonfinite_updates` counts the others."""
 
 
 class TrainState(struct.PyTreeNode):
@@ -77,13 +78,13 @@ class TrainState(struct.PyTreeNode):
 
 
 class NanDump(struct.PyTreeNode):
-    """A `NanDump` holds the first non-finite state of an unroll and the actions that led to it."""
+    """A `NanDump` holds what reproduces the first non-finite state of an unroll."""
 
     found: Any
     """Whether there is a non-finite state; otherwise the other fields have no meaning."""
     env_state: PyTree
-    """The state of one environment at the start of the unroll; a `Packed` on devices."""
+    """The state of its environment at the start of the unroll; a `Packed` on devices."""
     actions: Any
-    """The actions of the unroll, shape (time, action)."""
+    """The actions of the unroll from there, shape (time, action)."""
     step: Any
     """Index of the action that led to the non-finite state."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from jetbot_mjx.agents.brax_parts import Transition
-from jetbot_mjx.agents.learner import PackedEnv, Unroll
+from jetbot_mjx.agents.learner import PackedEnv, UnrollFn
 from jetbot_mjx.agents.random_keys import Keys
 from jetbot_mjx.agents.train_state import NanDump
 from jetbot_mjx.packed import Packed, pack
@@ -15,9 +15,9 @@ from jetbot_mjx.packed import Packed, pack
 _EXTRA_FIELDS = ("truncation", "episode_metrics", "episode_done")
 """Fields of the state's `info` that are collected."""
 
-Policy = Callable[[PyTree, Array], tuple[Array, PyTree]]
-"""From the observations of all environments, and what the noise is drawn from, to the actions and
-what Brax keeps of them."""
+Act = Callable[[PyTree, Array], tuple[Array, PyTree]]
+"""From the observations of all environments, and the keys or the noise of their actions, to the
+actions and what Brax keeps of them."""
 
 
 def kept_of(state: PyTree) -> dict[str, PyTree]:
@@ -49,19 +49,19 @@ def transition(obs: PyTree, action: Array, extras: PyTree, kept: dict[str, PyTre
     )
 
 
-def step_by_step(env: PackedEnv, policy: Policy, draw: Callable[[PRNGKeyArray], Array]) -> Unroll:
-    """Return an unroll in which policy and environments take turns.
+def step_by_step(env: PackedEnv, act: Act, draw: Callable[[PRNGKeyArray], Array]) -> UnrollFn:
+    """Return the function of an unroll in which policy and environments take turns.
 
     Args:
       env: the environment from `wrap_for_training`.
-      policy: the policy.
-      draw: draws from a key what the noise of each step follows from.
+      act: the policy.
+      draw: draws from a key what `act` takes in each step.
     """
 
     def step(start: Packed, drawn: Array) -> tuple[Packed, Packed]:
         # Act, step, and keep what the loss reads as one array.
         obs = start.unpack().obs
-        action, extras = policy(obs, drawn)
+        action, extras = act(obs, drawn)
         after = env.step_packed(start, action)
         data = transition(obs, action, extras, kept_of(after.unpack()))
         return after, pack(data, batch_axes=1)
@@ -90,7 +90,7 @@ def joined(data: Transition) -> Transition:
 
 
 def find_nan_dump(start: Packed, data: Transition) -> NanDump:
-    """Return the first non-finite state of an unroll.
+    """Return what reproduces the first non-finite state of an unroll.
 
     Args:
       start: the states at its start.

@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from jetbot_mjx.agents.brax_parts import Normalizer, Transition
-from jetbot_mjx.agents.learner import TREES, DeviceAxis, Layout, Learner, PackedEnv, Unroll
+from jetbot_mjx.agents.learner import TREES, DeviceAxis, Layout, Learner, PackedEnv, UnrollFn
 from jetbot_mjx.agents.networks import Networks
 from jetbot_mjx.agents.optimizer import adapt_step_size, make_optimizer, read_adam
 from jetbot_mjx.agents.train_state import LOSSES, TrainState
@@ -21,7 +21,7 @@ from jetbot_mjx.packed import Condensed, condense
 
 
 class XlaLearner(Learner):
-    """An `XlaLearner` leaves actions, loss, gradient and Adam to XLA, which serves every device."""
+    """An `XlaLearner` computes everything by JAX's functions, which XLA compiles for any device."""
 
     name = "xla"
     keeps_activations = True
@@ -50,22 +50,22 @@ class XlaLearner(Learner):
         self._fallback = fallback
         self._optimizer = make_optimizer(config)
 
-    def begin(self, tree: PyTree) -> PyTree:
-        """Return the trees of parameters and optimizer state."""
+    def to_working(self, tree: PyTree) -> PyTree:
+        """Return the trees of packed parameters and optimizer state."""
         return self.layout.unpack(tree)
 
-    def end(self, tree: PyTree) -> PyTree:
-        """Return parameters and optimizer state in the layout."""
+    def from_working(self, tree: PyTree) -> PyTree:
+        """Return the packed form of trees of parameters and optimizer state."""
         return self.layout.pack(tree)
 
-    def unroll(self, env: PackedEnv, state: TrainState) -> Unroll:
-        """Return an unroll with Brax's policy and its keys of the noise, as in `Learner`."""
+    def make_unroll(self, env: PackedEnv, state: TrainState) -> UnrollFn:
+        """Return the unroll of Brax's policy with Brax's keys of the noise, as in `Learner`."""
         from brax.training.agents.ppo.networks import make_inference_fn
 
         # Brax takes whatever has the attributes of its `PPONetworks`.
         networks: Any = self._networks
-        policy: Any = make_inference_fn(networks)(tuple(state.policy_params))
-        return step_by_step(env, policy, lambda key: action_keys(key, self._config.unroll_length))
+        act: Any = make_inference_fn(networks)(tuple(state.policy_params))
+        return step_by_step(env, act, lambda key: action_keys(key, self._config.unroll_length))
 
     def update(
         self,
@@ -76,6 +76,8 @@ class XlaLearner(Learner):
         key: PRNGKeyArray,
     ) -> tuple[PyTree, PyTree, Float[Array, " totals"]]:
         """Update the networks: passes, minibatches, loss, and a step of Adam, as in `Learner`."""
+        # While a program is traced: the cache stores the report with it, and repeats it whenever
+        # the program is loaded.
         if self._fallback:
             report(self._fallback)
 
@@ -87,6 +89,7 @@ class XlaLearner(Learner):
             )
             # A metric of an update that was not applied may be NaN.
             totals += jnp.where(metrics[-1] > 0, metrics, 0.0)
+            # XLA computes each array that a loop carries by a kernel of its own: carry few.
             return condense((params, optimizer_state, totals)), None
 
         # A pass: shuffle the unrolls, and split them into minibatches.
@@ -98,7 +101,7 @@ class XlaLearner(Learner):
 
             return jax.lax.scan(step, carry, (jax.tree.map(minibatches, data), loss_keys))
 
-        # All passes. XLA computes each array that a loop carries by a kernel of its own.
+        # All passes.
         start = condense((params, optimizer_state, jnp.zeros(len(LOSSES) + 1)))
         end, _ = jax.lax.scan(one_pass, start, self._draw_passes(key, data.reward.shape[0]))
         return end.restore()
@@ -161,7 +164,7 @@ class XlaLearner(Learner):
         differentiate: Any = jax.value_and_grad(self.loss, has_aux=True)
         (_, metrics), gradient = differentiate(params, normalizer, batch, key)
         if self._devices.size == 1:
-            return metrics, self._devices.mean(gradient)
+            return metrics, gradient
         # One vector: CPUs wait for each other in every mean.
         vector, unravel = jax.flatten_util.ravel_pytree(gradient)
         return metrics, unravel(self._devices.mean(vector))
@@ -169,7 +172,7 @@ class XlaLearner(Learner):
     def loss(
         self, params: PyTree, normalizer: Normalizer, batch: Transition, key: PRNGKeyArray
     ) -> tuple[Array, Mapping[str, Array]]:
-        """Compute the loss of a minibatch, of images by their features."""
+        """Compute the loss of a minibatch; images are encoded to features first."""
         # Late: a training whose programs are found compiled needs no loss.
         from jetbot_mjx.agents.loss import ppo_loss
 

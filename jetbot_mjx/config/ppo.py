@@ -119,9 +119,14 @@ class PPOConfig(Section):
         return -(-self.num_timesteps // self.steps_per_training_step)
 
     @property
+    def updates_per_training_step(self) -> int:
+        """Return the number of minibatches of one training step."""
+        return self.num_updates_per_batch * self.num_minibatches
+
+    @property
     def gradient_steps(self) -> int:
         """Return the number of minibatches of all training steps."""
-        return self.training_steps * self.num_minibatches * self.num_updates_per_batch
+        return self.training_steps * self.updates_per_training_step
 
     @model_validator(mode="after")
     def _whole_batches(self) -> Self:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
 from jetbot_mjx import envs
-from jetbot_mjx.agents import Networks, PolicyParams, by_kernel, make_policy, raw_key
+from jetbot_mjx.agents import Networks, PolicyParams, kernel_key, make_policy, raw_key
 from jetbot_mjx.envs import DomainRandomizationWrapper, JetBotEnv, State
 from jetbot_mjx.errors import check_count
 from jetbot_mjx.evaluation.goal_set import MOST_GOALS
@@ -49,7 +49,7 @@ def training_keys(episodes: int) -> UInt32[Array, "n 2"]:
 
 
 def _fixed_keys(seed: int, episodes: int) -> UInt32[Array, "n 2"]:
-    key = by_kernel(jax.random.PRNGKey(seed))
+    key = kernel_key(jax.random.PRNGKey(seed))
     return raw_key(jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(episodes)))
 
 

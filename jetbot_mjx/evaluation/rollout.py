@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
 from jetbot_mjx import envs
-from jetbot_mjx.agents import by_kernel, raw_key
+from jetbot_mjx.agents import kernel_key, raw_key
 from jetbot_mjx.envs import QPOS_XYZ, AdaptedEnv, JetBotEnv, State
 from jetbot_mjx.mjx_import import Wrapper
 from jetbot_mjx.packed import Packed, pack
@@ -207,7 +207,7 @@ def _loop_fn(
     batch = envs.BatchWrapper(one)
     # Fold in twice: `fold_in(key, 1)` alone equals `split(key)[1]`, from which the goal is drawn.
     fold_in = jax.vmap(
-        lambda key, data: raw_key(jax.random.fold_in(by_kernel(key), data)), (0, None)
+        lambda key, data: raw_key(jax.random.fold_in(kernel_key(key), data)), (0, None)
     )
 
     def run(

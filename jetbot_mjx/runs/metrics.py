@@ -11,7 +11,7 @@ timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.p
                             return_min, episode_length
   eval/final_distance_median  [m] distance to the goal at the end, on the floor
   eval/nonfinite_envs       episodes that were cut off because of a non-finite state
-  loss/total, policy, value, entropy  means over the interval, as Brax computes them
+  loss/total, policy, value, entropy  means over the applied updates, as Brax computes them
   policy/entropy            [nat] entropy of the actions, after squashing
   policy/kl                 mean KL divergence between the policies before and after an update
   policy/std                standard deviation of the action distribution, before squashing

@@ -378,9 +378,12 @@ def _metrics(totals: Mapping[str, Array], ppo: PPO) -> dict[str, float]:
     steps, episodes = sums["training_steps"], sums["rollout/episodes"]
     if steps == 0:
         return {}
-    metrics = {name: sums[name] / steps for name in LOSSES.values()}
-    if ppo.config.entropy_cost > 0:
-        metrics["policy/entropy"] = -metrics["loss/entropy"] / ppo.config.entropy_cost
+    metrics = {}
+    applied = steps * ppo.config.updates_per_training_step - sums["nonfinite_updates"]
+    if applied > 0:
+        metrics |= {name: sums[name] / applied for name in LOSSES.values()}
+        if ppo.config.entropy_cost > 0:
+            metrics["policy/entropy"] = -metrics["loss/entropy"] / ppo.config.entropy_cost
     metrics["rollout/episodes"] = episodes
     if episodes > 0:
         if ppo.has_success:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jetbot_mjx.agents.random_keys import by_kernel, raw_key
+from jetbot_mjx.agents.random_keys import kernel_key, raw_key
 from onekernel.build import cpu
 
 pytestmark = [
@@ -32,7 +32,7 @@ def draws(key):
 
 
 def by_kernels(key):
-    return draws(by_kernel(key))
+    return draws(kernel_key(key))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2**31 - 1])
@@ -44,13 +44,13 @@ def test_they_are_those_of_jax(seed):
 
 def test_they_are_drawn_by_kernels():
     key = jax.random.PRNGKey(0)
-    lowered = jax.jit(lambda key: jax.random.normal(by_kernel(key), (3,))).lower(key)
+    lowered = jax.jit(lambda key: jax.random.normal(kernel_key(key), (3,))).lower(key)
     assert len(cpu.kernels_in(lowered.as_text())) == 1
 
 
 def test_a_batch_of_keys_is_one_launch():
     keys = jax.random.split(jax.random.PRNGKey(0), 6)
-    draw = jax.vmap(lambda key: jax.random.uniform(by_kernel(key), (50,)))
+    draw = jax.vmap(lambda key: jax.random.uniform(kernel_key(key), (50,)))
     expected = jax.vmap(lambda key: jax.random.uniform(key, (50,)))(keys)
     np.testing.assert_array_equal(jax.jit(draw)(keys), expected)
 
@@ -58,13 +58,13 @@ def test_a_batch_of_keys_is_one_launch():
 def test_without_a_back_end_jax_draws(monkeypatch):
     monkeypatch.setattr(cpu, "obstacle", lambda: "there is none")
     key = jax.random.PRNGKey(0)
-    assert by_kernel(key) is key
+    assert kernel_key(key) is key
 
 
 def test_other_bits_of_threefry_are_jax_s():
     key = jax.random.PRNGKey(0)
     jax.config.update("jax_threefry_partitionable", False)
     try:
-        assert by_kernel(key) is key
+        assert kernel_key(key) is key
     finally:
         jax.config.update("jax_threefry_partitionable", True)

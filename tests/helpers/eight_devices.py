@@ -116,8 +116,13 @@ def averaging():
     assert normalizer.mean.shape == (OBS,)
     data, key = made_up(alone), jax.random.PRNGKey(0)
     whole = PartitionSpec()
+
+    def update_among(*given):
+        params, optimizer_state, totals = among.learner.update(*given)
+        return params, optimizer_state, jax.lax.pmean(totals, "devices")
+
     sharded = jax.shard_map(
-        among.update,
+        update_among,
         mesh=Mesh(np.array(jax.devices()[:2]), ("devices",)),
         in_specs=(whole, whole, whole, PartitionSpec("devices"), whole),
         out_specs=whole,
@@ -126,11 +131,12 @@ def averaging():
 
     def moment(update, data):
         """The moment, and the total loss, the first of `LOSSES`."""
-        _, state, metrics = jax.jit(update)(params, optimizer_state, normalizer, data, key)
-        return jax.device_get((state[-1].inner_state[0].mu, metrics[0]))
+        _, state, totals = jax.jit(update)(params, optimizer_state, normalizer, data, key)
+        return jax.device_get((state[-1].inner_state[0].mu, totals[0]))
 
-    (all_of_it, loss), (together, same_loss) = moment(alone.update, data), moment(sharded, data)
-    half, _ = moment(alone.update, jax.tree.map(lambda x: x[:16], data))
+    update = alone.learner.update
+    (all_of_it, loss), (together, same_loss) = moment(update, data), moment(sharded, data)
+    half, _ = moment(update, jax.tree.map(lambda x: x[:16], data))
     return {
         "difference": furthest(all_of_it, together).item(),
         "of_a_half": furthest(all_of_it, half).item(),

@@ -18,7 +18,7 @@ TOGETHER = {
     "adapters/test_gymnasium": "adapters.arguments adapters.base adapters.renderer envs.mujoco_env",
     "adapters/test_vector": "adapters.batched_env",
     "agents/test_fused_learner": "agents.fused",
-    "agents/test_learners": "agents.learner",
+    "agents/test_choose_learner": "agents.learner",
     "agents/test_ppo": "agents.brax_parts agents.train_state agents.xla_learner"
     " training.brax_trainer",
     "agents/test_unroll": "agents.fused.cpu_actions",

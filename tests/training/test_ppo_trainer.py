@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from brax.training.types import UInt64
 
-from jetbot_mjx.training.ppo_trainer import CompiledTrainer
+from jetbot_mjx.agents import LOSSES, TALLIED
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer, _metrics
 
 
 def test_to_take_the_seeds_apart_compiles_nothing():
@@ -29,3 +31,26 @@ def test_to_take_the_seeds_apart_compiles_nothing():
         jax.monitoring.unregister_event_duration_listener(listen)
     assert [int(one["steps"]) for one in each] == [5, 7]
     assert not [event for event in events if "backend_compile" in event]
+
+
+def logged(training_steps, skipped, losses):
+    """The metrics of some training steps with 16 updates each, whose losses add up to these."""
+    ppo = parse_config({"ppo": {"num_minibatches": 4, "num_updates_per_batch": 4}}).ppo
+    sums = dict.fromkeys(TALLIED, 0.0) | dict.fromkeys(LOSSES.values(), losses)
+    sums |= {"training_steps": training_steps, "nonfinite_updates": skipped}
+    return _metrics(sums, types.SimpleNamespace(config=ppo, has_success=True))
+
+
+def test_a_skipped_update_is_no_part_of_a_mean():
+    # One update of the second training step is applied, and then none of a third one.
+    for training_steps, skipped in ((2, 15), (3, 31)):
+        metrics = logged(training_steps, skipped, losses=17 * 0.5)
+        assert [metrics[name] for name in LOSSES.values()] == [0.5] * len(LOSSES)
+        assert metrics["train/nonfinite_updates"] == skipped
+
+
+def test_where_no_update_was_applied_there_is_no_loss():
+    metrics = logged(2, 32, losses=0.0)
+    assert not {*LOSSES.values(), "policy/entropy"} & metrics.keys()
+    assert metrics["train/nonfinite_updates"] == 32
+    assert logged(0, 0, losses=0.0) == {}

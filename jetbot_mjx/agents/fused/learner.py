@@ -20,7 +20,7 @@ from jetbot_mjx.agents.fused.adam import AdamRule, AdamTerms, Progress
 from jetbot_mjx.agents.fused.layout import VectorLayout
 from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch, UpdateShape
 from jetbot_mjx.agents.fused.shapes import Unroll as UnrollSpec
-from jetbot_mjx.agents.learner import ONE_DEVICE, DeviceAxis, Learner, PackedEnv, Unroll
+from jetbot_mjx.agents.learner import ONE_DEVICE, DeviceAxis, Learner, PackedEnv, UnrollFn
 from jetbot_mjx.agents.optimizer import read_adam, write_adam
 from jetbot_mjx.agents.random_keys import Keys
 from jetbot_mjx.agents.train_state import LOSSES, TrainState
@@ -145,7 +145,7 @@ class FusedLearner(Learner):
 
     # The collection.
 
-    def unroll(self, env: PackedEnv, state: TrainState) -> Unroll:
+    def make_unroll(self, env: PackedEnv, state: TrainState) -> UnrollFn:
         """Return an unroll by one kernel if a step of the environments is one, as in `Learner`."""
         # Policy and environments take turns where a step of these is more than one kernel.
         spec = self.unroll_spec(env, state.env_state)

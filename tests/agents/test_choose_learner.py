@@ -112,9 +112,9 @@ def test_in_the_place_of_kernels_xla_takes_and_returns_their_vectors():
 
     @jax.jit
     def update(vectors):
-        params, optimizer_state = instead.begin(vectors)
+        params, optimizer_state = instead.to_working(vectors)
         *tree, totals = instead.update(params, optimizer_state, statistics, data, key)
-        return instead.end(tuple(tree)), totals
+        return instead.from_working(tuple(tree)), totals
 
     with collect() as found:
         ours, totals = update(vectors)
