@@ -114,8 +114,8 @@ class Learner(Protocol):
         """Return why a check on this machine forbids the update; None: nothing does."""
         return None
 
-    def prepare(self, policies: int) -> None:
-        """Begin to compile kernels in threads, for a number of policies that train at once."""
+    def prepare(self, replicas: int) -> None:
+        """Begin to compile kernels in threads, for a number of trainings that run at once."""
 
     # Inside the program: once around all steps, and in each step.
 

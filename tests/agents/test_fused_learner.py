@@ -23,7 +23,7 @@ from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel
 from jetbot_mjx.agents.fused.gpu_gradient import GradientKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
 from jetbot_mjx.agents.fused.learner import FusedLearner, make_fused_learner, shape_of
-from jetbot_mjx.agents.fused.shapes import Minibatch
+from jetbot_mjx.agents.fused.shapes import DataSizes
 from jetbot_mjx.agents.learner import ONE_DEVICE, DeviceAxis
 from jetbot_mjx.agents.networks import Networks
 from jetbot_mjx.agents.optimizer import make_optimizer
@@ -63,7 +63,7 @@ def test_it_says_which_networks_it_cannot_compute(changes, sizes, reason):
 )
 def test_it_says_which_networks_a_gpu_cannot_compute(changes, sizes, reason):
     shape = shape_of(config(**changes).ppo, *sizes)
-    assert reason in launch_gpu.refusal(shape, Minibatch(64, 16, 4))
+    assert reason in launch_gpu.refusal(shape, DataSizes(64, 16, 4))
 
 
 @pytest.mark.cpu
@@ -280,7 +280,7 @@ def modelled(shape, *arrays):
     def run(*arrays):
         given = [np.array(x) for x in arrays]
         params, mean, scale, rows, last, unrolls, noise, index, terms = given
-        batch = Minibatch(len(rows), unrolls.shape[1], rows.shape[1], len(unrolls))
+        batch = DataSizes(len(rows), unrolls.shape[1], rows.shape[1], len(unrolls))
         tiling = Tiling(shape, 64, 1, "advantages")
         blocks = min(2, tiling.tiles(batch))
         kernel = AdvantageKernel(tiling, batch, blocks)
@@ -302,12 +302,12 @@ def modelled(shape, *arrays):
 def modelled_actions(shape, *arrays):
     """`launch.actions` on the model of a GPU, for one policy."""
     count = arrays[3].shape[0]
-    shapes = ACTION_ARRAYS.shapes(shape, Minibatch(environments=count))
+    shapes = ACTION_ARRAYS.shapes(shape, DataSizes(environments=count))
     results = [jax.ShapeDtypeStruct(shapes[x], np.float32) for x in launch.Actions._fields]
 
     def run(*arrays):
         drawn = [np.full(x.shape, np.nan, np.float32) for x in results]
-        kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), Minibatch(environments=count), 1)
+        kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), DataSizes(environments=count), 1)
         given = [*(np.array(x) for x in arrays), *drawn]
         simt.run(kernel.text(), given, shared_memory=kernel.shared_memory)
         return drawn
@@ -470,7 +470,7 @@ def assert_gradient_is_xlas(settings):
         return fused.gradient(fused.layout.pack(params), shuffled, *drawn_for(fused, places, key))
 
     vector = ours(params)
-    places = jnp.asarray(fused.rule.places)
+    places = jnp.asarray(fused.rule.metric_places)
     found, vector = fused.metrics(vector[places]), vector.at[places].set(0.0)
     error = jnp.linalg.norm(vector - fused.layout.pack(expected)) / jnp.linalg.norm(vector)
     assert error < 0.01
@@ -558,7 +558,7 @@ def test_adam_is_that_of_optax(schedule, distribution, compute):
         xla.gradient = lambda *_: given
         return xla.minibatch_step(*state, statistics, batch, jax.random.PRNGKey(0))
 
-    sizes = np.asarray(fused.rule.places)
+    sizes = np.asarray(fused.rule.metric_places)
     for call, count in enumerate((2, 6)):
         totals, vectors = jnp.zeros_like(totals), fused.first_vectors(*ours)
         vectors = *vectors[:3], vectors[3][: count + 1]

@@ -22,7 +22,7 @@ from helpers.update_cases import (
 from jetbot_mjx.agents.fused import arrays as signatures
 from jetbot_mjx.agents.fused import launch_cpu, launch_gpu
 from jetbot_mjx.agents.fused.adam import SIZES, AdamRule
-from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.shapes import DataSizes, UpdateShape
 
 pytest.importorskip("llvmlite")
 
@@ -37,11 +37,11 @@ SHAPES = {
 CASES = [
     # Policies that share the multiprocessors, and blocks with several tiles, of which the last one
     # is not full.
-    ("swish", Minibatch(40, 37, 9), 2, 90),
-    ("relu", Minibatch(20, 13, 10), 1, 86),
-    pytest.param("elu", Minibatch(90, 90, 5), 3, 80, marks=pytest.mark.slow),
+    ("swish", DataSizes(40, 37, 9), 2, 90),
+    ("relu", DataSizes(20, 13, 10), 1, 86),
+    pytest.param("elu", DataSizes(90, 90, 5), 3, 80, marks=pytest.mark.slow),
     # Several blocks of one policy.
-    ("tanh", Minibatch(20, 19, 16), 1, 80),
+    ("tanh", DataSizes(20, 19, 16), 1, 80),
 ]
 """Networks, minibatch, policies, and the GPU's compute capability."""
 
@@ -119,7 +119,7 @@ def test_a_step_of_adam_is_that_of_a_cpu(name, schedule, model):
 def small_gradient():
     """Several tiles of both kernels, and two networks whose layers several warps share."""
     shape = UpdateShape(7, 32, 2, 2, "tanh_normal", "tanh", normalizes=False)
-    case = Case(shape, Minibatch(14, 14, 20), (0, 0), 0)
+    case = Case(shape, DataSizes(14, 14, 20), (0, 0), 0)
     made = [make_data(case, 0)]
     launched_by(
         launch_gpu, signatures.GRADIENT, shape, [*stacked(made, *NETWORK, *DRAWN), terms_of(case)]
@@ -135,7 +135,7 @@ def small_actions():
 
 def small_adam():
     rule = AdamRule(SHAPES["elu"], 64, "NONE", 1)
-    shapes = signatures.ADAM.shapes(rule, Minibatch()).values()
+    shapes = signatures.ADAM.shapes(rule, DataSizes()).values()
     arrays = [
         np.arange(math.prod(x), dtype=np.float32).reshape(1, *x) + np.float32(1) for x in shapes
     ]

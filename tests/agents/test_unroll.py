@@ -10,7 +10,7 @@ from helpers.further import slow_unless
 from helpers.gliding import Gliding
 from jetbot_mjx.agents.fused import launch
 from jetbot_mjx.agents.fused.arrays import UNROLL
-from jetbot_mjx.agents.fused.shapes import Unroll
+from jetbot_mjx.agents.fused.shapes import UnrollSpec
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.packed import pack
@@ -186,7 +186,7 @@ def test_an_unroll_of_other_shapes_is_refused(root, wrong):
     ppo = built(root)
     state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
     shape, words = ppo.learner.shape, state.env_state.words.shape
-    spec = Unroll(shape, ppo._env.step_packed.kernel(state.env_state), 0, (3, 4, 1))
+    spec = UnrollSpec(shape, ppo._env.step_packed.kernel(state.env_state), 0, (3, 4, 1))
     sizes = [(shape.size,), (16,), (16,), words, (LENGTH, words[0], 2)]
     arrays = [jax.ShapeDtypeStruct(size, np.float32) for size in sizes]
     jax.eval_shape(lambda *x: launch.unroll(spec, *x), *arrays)

@@ -30,7 +30,7 @@ from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel
 from jetbot_mjx.agents.fused.gpu_gradient import GradientKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
 from jetbot_mjx.agents.fused.launch_gpu import PTX_VERSION
-from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.shapes import DataSizes, UpdateShape
 from onekernel import cpu, gpu
 
 pytest.importorskip("llvmlite")
@@ -41,7 +41,7 @@ WARPS, SWISH = "a warp for 16 rows", "swish, advantages as they are"
 
 def drawn(shape, environments):
     """The shapes of `launch.Actions`."""
-    shapes = signatures.ACTIONS.shapes(shape, Minibatch(environments=environments))
+    shapes = signatures.ACTIONS.shapes(shape, DataSizes(environments=environments))
     return [shapes[name] for name in launch.Actions._fields]
 
 
@@ -61,7 +61,7 @@ def test_the_advantages_are_those_of_float64(name):
         np.full((case.seeds, *rest), np.nan, np.float32)
         for rest in (case.batch[1:3], case.batch[1:3], (blocks, 2))
     ]
-    arrays = [*stacked(made, *NETWORK, "last", "unrolls", "index"), terms_of(case), *results]
+    arrays = [*stacked(made, *NETWORK, "last", "unroll_indices", "index"), terms_of(case), *results]
     sizes = kernel.threads, kernel.shared_memory
     simt.run(kernel.text(), arrays, (blocks, 1, case.seeds), *sizes)
     for data, advantage, target, parts in zip(made, *results, strict=True):
@@ -86,7 +86,7 @@ def test_the_gradient_is_that_of_float64(name):
     thirds = [np.array_split(data.advantages.ravel(), 3) for data in made]
     parts = np.array([[[x.sum(), (x**2).sum()] for x in third] for third in thirds], np.float32)
     result = np.full((case.seeds, blocks, case.shape.size), np.nan, np.float32)
-    arrays = [*stacked(made, *NETWORK, "unrolls", "noise", "index"), *estimated, parts]
+    arrays = [*stacked(made, *NETWORK, "unroll_indices", "noise", "index"), *estimated, parts]
     arrays += [terms_of(case), result]
     sizes = kernel.threads, kernel.shared_memory
     simt.run(kernel.text(), arrays, (blocks, 2, case.seeds), *sizes)
@@ -98,10 +98,10 @@ def test_the_gradient_is_that_of_float64(name):
 CPU_CASES = {
     **CASES,
     "a layer of 256": Case(
-        UpdateShape(70, 256, 1, 5, "tanh_normal", "elu"), Minibatch(90, 90, 3), (0, 0), 0
+        UpdateShape(70, 256, 1, 5, "tanh_normal", "elu"), DataSizes(90, 90, 3), (0, 0), 0
     ),
     "several parts": Case(
-        UpdateShape(3, 16, 2, 1, "normal", "tanh"), Minibatch(90, 70, 11), (0, 0), 0, seeds=2
+        UpdateShape(3, 16, 2, 1, "normal", "tanh"), DataSizes(90, 70, 11), (0, 0), 0, seeds=2
     ),
 }
 
@@ -151,13 +151,13 @@ def test_the_gradient_on_a_cpu_does_not_depend_on_the_policies_beside_it():
     [
         (
             UpdateShape(16, 128, 3, 9, "tanh_normal", "tanh"),
-            Minibatch(9, 9, 9),
+            DataSizes(9, 9, 9),
             "16 outputs, not 18",
         ),
-        (UpdateShape(16, 40, 3, 2, "normal", "tanh"), Minibatch(9, 9, 9), "48, ... units, not 40"),
+        (UpdateShape(16, 40, 3, 2, "normal", "tanh"), DataSizes(9, 9, 9), "48, ... units, not 40"),
         (
             UpdateShape(16, 128, 3, 2, "normal", "tanh"),
-            Minibatch(9, 9, 2000),
+            DataSizes(9, 9, 2000),
             "2000 steps do not fit",
         ),
     ],
@@ -187,7 +187,7 @@ def test_the_actions_are_those_of_float64(name, rows):
     results = [np.full((2, *size), np.nan, np.float32) for size in drawn(shape, environments)]
     # Of two blocks, the model runs the one with the second tile after that with the third.
     for blocks in (1, 2):
-        kernel = ActionKernel(tiling, Minibatch(environments=environments), blocks)
+        kernel = ActionKernel(tiling, DataSizes(environments=environments), blocks)
         sizes = (blocks, 1, 2), kernel.threads, kernel.shared_memory
         simt.run(kernel.text(), [*given, *results], *sizes)
     for i, (_, expected) in enumerate(made):
@@ -233,7 +233,7 @@ def test_the_actions_at_the_ends_of_their_ranges_are_those_of_float64(name, spre
     arrays, expected = make_actions(shape, 40, 0, spread)
     on_a_cpu = jax.jit(functools.partial(launch.actions, shape))
     on_a_gpu = [np.full(size, np.nan, np.float32) for size in drawn(shape, 40)]
-    kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), Minibatch(environments=40), 2)
+    kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), DataSizes(environments=40), 2)
     sizes = (2, 1, 1), kernel.threads, kernel.shared_memory
     simt.run(kernel.text(), [*arrays, *on_a_gpu], *sizes)
     for results in ([np.asarray(x) for x in on_a_cpu(*arrays)], on_a_gpu):
@@ -249,7 +249,7 @@ def test_the_actions_at_the_ends_of_their_ranges_are_those_of_float64(name, spre
 )
 def test_a_tile_of_actions_fills_the_gpu(environments, memory, rows):
     shape = UpdateShape(16, 128, 3, 2, "tanh_normal", "tanh")
-    batch = Minibatch(environments=environments)
+    batch = DataSizes(environments=environments)
     assert gpu_tiling.best_tiling("actions", shape, batch, 132, memory).rows == rows
 
 
@@ -266,9 +266,9 @@ def test_llvm_compiles_them(name, architecture):
     others = (Tiling(case.shape, 64, 1, purpose) for purpose in ("advantages", "actions"))
     tilings = Tiling(case.shape, *case.gradient), *others
     kernels = (
-        GradientKernel(tilings[0], Minibatch(4096, 512, 16), 66, 74),
-        AdvantageKernel(tilings[1], Minibatch(4096, 512, 16), 74),
-        ActionKernel(tilings[2], Minibatch(environments=4096), 132),
+        GradientKernel(tilings[0], DataSizes(4096, 512, 16), 66, 74),
+        AdvantageKernel(tilings[1], DataSizes(4096, 512, 16), 74),
+        ActionKernel(tilings[2], DataSizes(environments=4096), 132),
     )
     for tiling, kernel in zip(tilings, kernels, strict=True):
         ptx = gpu.assembled(kernel.text(), architecture, PTX_VERSION)
@@ -291,5 +291,5 @@ def test_llvm_compiles_them(name, architecture):
 )
 def test_the_tile_is_the_largest_that_fits(width, layers, activation, memory, rows):
     shape = UpdateShape(16, width, layers, 2, "tanh_normal", activation)
-    tiling = gpu_tiling.best_tiling("gradient", shape, Minibatch(9, 9, 9), 1, memory)
+    tiling = gpu_tiling.best_tiling("gradient", shape, DataSizes(9, 9, 9), 1, memory)
     assert (tiling.rows if tiling else None) == rows

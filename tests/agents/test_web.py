@@ -35,7 +35,7 @@ NETWORKS = {
 CALL = """
 const memory = new Memory(await WebAssembly.compile(given.module)), { about } = given, room = {};
 for (const [name, size] of about.arrays)
-  room[name] ??= memory.array(size, name === "unrolls" ? Int32Array : Float32Array);
+  room[name] ??= memory.array(size, name === "unroll_indices" ? Int32Array : Float32Array);
 for (const [name, numbers] of Object.entries(given.arrays)) {
   if (room[name].length !== numbers.length) throw Error(`${name} has ${room[name].length} numbers`);
   room[name].view.set(numbers);
@@ -93,7 +93,7 @@ def made_up(settings):
     )
     given = dict(zip(arrays.UPDATE.arguments, values, strict=True))
     return fused, {
-        name: np.asarray(x, np.int32 if name == "unrolls" else np.float32)
+        name: np.asarray(x, np.int32 if name == "unroll_indices" else np.float32)
         for name, x in given.items()
     }
 
@@ -121,7 +121,7 @@ def test_an_update_is_the_cpus(activation):
     assert ours["progress"][-1] == fused.rule.steps == 16
     assert relative(ours["params"], given["params"]) > 1e-3
     # What is read is not changed.
-    for name in ("rows", "last", "mean", "scale", "noise", "terms", "adam_terms"):
+    for name in ("rows", "last", "mean", "inverse_std", "noise", "terms", "adam_terms"):
         np.testing.assert_array_equal(ours[name], flat[name])
 
 
@@ -134,7 +134,7 @@ def test_the_gradient_of_a_minibatch_is_the_cpus(activation):
     about, module = compiled(activation, **one)
     fused, given = made_up(settings_of(activation, **one))
     index = np.int32(0)
-    names = ("params", "mean", "scale", "rows", "last", "unrolls", "noise")
+    names = ("params", "mean", "inverse_std", "rows", "last", "unroll_indices", "noise")
     arguments = [*(given[name] for name in names), index, given["terms"]]
     theirs = np.asarray(jax.jit(functools.partial(launch.gradient, fused.shape))(*arguments))
     ours = node.run(
@@ -156,7 +156,7 @@ def test_actions_are_the_cpus(activation):
     about, module = compiled(activation)
     fused, given = made_up(settings_of(activation))
     rng, count = np.random.default_rng(1), fused.batch.environments
-    given = {name: given[name] for name in ("params", "mean", "scale")} | {
+    given = {name: given[name] for name in ("params", "mean", "inverse_std")} | {
         "observations": np.float32(rng.normal(size=(count, OBSERVATIONS))),
         "action_noise": np.float32(rng.normal(size=(count, ACTIONS))),
     }

@@ -105,7 +105,7 @@ def test_an_update_is_that_of_the_cpus_kernel_from_the_same_arrays(steps, fused)
 def test_an_update_is_given_what_the_packages_is(steps, fused, page):
     given, ppo = shaped(fused, steps["before"]), page.checkpoint.config.ppo
     # Every pass has each unroll once, in another order.
-    orders = given["unrolls"].reshape(ppo.num_updates_per_batch, -1)
+    orders = given["unroll_indices"].reshape(ppo.num_updates_per_batch, -1)
     everyone = np.arange(fused.batch.collected)
     np.testing.assert_array_equal(np.sort(orders, axis=1), np.tile(everyone, (len(orders), 1)))
     assert len({tuple(order) for order in [*orders, everyone]}) == len(orders) + 1
@@ -194,7 +194,7 @@ def test_what_is_collected_is_what_the_packages_robots_do(fused, page):
 
 def test_actions_are_drawn_from_the_policy(steps, fused):
     second = columns(fused, steps["second"]["rows"])
-    vectors = [steps["second"]["params"], steps["taken"]["mean"], steps["taken"]["scale"]]
+    vectors = [steps["second"]["params"], steps["taken"]["mean"], steps["taken"]["inverse_std"]]
     observations = second["observation"].reshape(-1, fused.shape.observations)
     noise = np.zeros((len(observations), fused.shape.actions), np.float32)
     drawn = jax.jit(functools.partial(launch.actions, fused.shape))(*vectors, observations, noise)
@@ -226,9 +226,9 @@ def test_the_normaliser_is_braxs(steps, fused, page):
         smallest = page.env.observation_min_std
         np.testing.assert_allclose(steps[known]["mean"], state.mean, rtol=1e-5, atol=1e-6)
         deviation = np.maximum(state.std, smallest)
-        np.testing.assert_allclose(steps[known]["scale"], 1 / deviation, rtol=1e-5)
+        np.testing.assert_allclose(steps[known]["inverse_std"], 1 / deviation, rtol=1e-5)
     # Before anything is known, the networks take observations as they are.
-    assert np.all(steps["first"]["scale"] == 1)
+    assert np.all(steps["first"]["inverse_std"] == 1)
     assert np.all(steps["first"]["mean"] == 0)
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.training.distribution import NormalDistribution, NormalTanhDistribution
 
-from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.shapes import DataSizes, LossTerms, UpdateShape
 from jetbot_mjx.agents.gae import compute_gae
 
 TERMS = LossTerms(
@@ -35,7 +35,7 @@ class Case(NamedTuple):
     """A minibatch, and how it is divided among blocks."""
 
     shape: UpdateShape
-    batch: Minibatch
+    batch: DataSizes
     gradient: tuple[int, int]
     """Rows of a tile, and row tiles of a warp."""
     rows: int
@@ -48,26 +48,26 @@ class Case(NamedTuple):
 # fill a tile, and observations that do not either.
 CASES = {
     "three layers of 128": Case(
-        UpdateShape(16, 128, 3, 2, "tanh_normal", "tanh"), Minibatch(30, 25, 8), (128, 2), 128
+        UpdateShape(16, 128, 3, 2, "tanh_normal", "tanh"), DataSizes(30, 25, 8), (128, 2), 128
     ),
     "a warp for 16 rows": Case(
-        UpdateShape(16, 128, 3, 2, "tanh_normal", "tanh"), Minibatch(20, 19, 16), (128, 1), 256, 2
+        UpdateShape(16, 128, 3, 2, "tanh_normal", "tanh"), DataSizes(20, 19, 16), (128, 1), 256, 2
     ),
     "48 units": Case(
-        UpdateShape(5, 48, 2, 2, "tanh_normal", "elu"), Minibatch(60, 50, 6), (128, 2), 64, 2
+        UpdateShape(5, 48, 2, 2, "tanh_normal", "elu"), DataSizes(60, 50, 6), (128, 2), 64, 2
     ),
     "80 units, normal": Case(
-        UpdateShape(7, 80, 1, 3, "normal", "relu"), Minibatch(5, 2, 65), (128, 2), 128
+        UpdateShape(7, 80, 1, 3, "normal", "relu"), DataSizes(5, 2, 65), (128, 2), 128
     ),
     "four layers, small tiles": Case(
-        UpdateShape(33, 64, 4, 2, "normal", "tanh"), Minibatch(13, 13, 10), (64, 1), 64, 1
+        UpdateShape(33, 64, 4, 2, "normal", "tanh"), DataSizes(13, 13, 10), (64, 1), 64, 1
     ),
     "two seeds, one step": Case(
-        UpdateShape(64, 16, 1, 4, "tanh_normal", "swish"), Minibatch(99, 70, 1), (32, 1), 64, 2, 2
+        UpdateShape(64, 16, 1, 4, "tanh_normal", "swish"), DataSizes(99, 70, 1), (32, 1), 64, 2, 2
     ),
     "swish, advantages as they are": Case(
         UpdateShape(16, 112, 2, 2, "normal", "swish", normalizes=False),
-        Minibatch(12, 7, 10),
+        DataSizes(12, 7, 10),
         (32, 1),
         64,
     ),
@@ -98,7 +98,7 @@ def network(rng, shape, outputs):
 
 def forward(layers, data, shape):
     """The outputs of a network."""
-    x = (data["observation"] - data["mean"]) * data["scale"]
+    x = (data["observation"] - data["mean"]) * data["inverse_std"]
     for i in range(0, len(layers), 2):
         x = x @ layers[i] + layers[i + 1]
         x = ACTIVATIONS[shape.activation](x) if i + 2 < len(layers) else x
@@ -161,7 +161,7 @@ def random_data(rng, case):
     steps = unrolls, time
     data = {
         "mean": rng.normal(size=shape.observations),
-        "scale": 1 / (0.5 + np.abs(rng.normal(size=shape.observations))),
+        "inverse_std": 1 / (0.5 + np.abs(rng.normal(size=shape.observations))),
         "observation": rng.normal(size=(*steps, shape.observations)),
         "last": rng.normal(size=(unrolls, shape.observations)),
         "raw_action": 0.7 * rng.normal(size=(*steps, shape.actions)),
@@ -219,18 +219,18 @@ def make_data(case, seed):
     arguments = {
         "params": np.concatenate([np.ravel(x) for x in flat]),
         "mean": data["mean"],
-        "scale": data["scale"],
+        "inverse_std": data["inverse_std"],
         "rows": rows,
         "last": last,
-        "unrolls": unrolls,
+        "unroll_indices": unrolls,
         "noise": data["noise"],
     }
     arguments = {
-        name: np.asarray(x, np.int32 if name == "unrolls" else np.float32)
+        name: np.asarray(x, np.int32 if name == "unroll_indices" else np.float32)
         for name, x in arguments.items()
     }
     # The other minibatches have no noise, and their unrolls are not there.
-    for name, nothing in (("unrolls", -1), ("noise", np.nan)):
+    for name, nothing in (("unroll_indices", -1), ("noise", np.nan)):
         whole = np.full((COUNT, *arguments[name].shape), nothing, arguments[name].dtype)
         whole[INDEX] = arguments[name]
         arguments[name] = whole
@@ -244,9 +244,9 @@ def stacked(made, *names):
     return [np.stack([data.arguments[name] for data in made]) for name in names]
 
 
-NETWORK = ("params", "mean", "scale", "rows")
+NETWORK = ("params", "mean", "inverse_std", "rows")
 
-DRAWN = ("last", "unrolls", "noise", "index")
+DRAWN = ("last", "unroll_indices", "noise", "index")
 
 
 def terms_of(case):
@@ -295,7 +295,7 @@ def make_actions(shape, environments, seed, spread=None):
     flat.append(np.full(shape.size - sum(map(len, flat)), np.nan))
     data = {
         "mean": rng.normal(size=shape.observations),
-        "scale": 1 / (0.5 + np.abs(rng.normal(size=shape.observations))),
+        "inverse_std": 1 / (0.5 + np.abs(rng.normal(size=shape.observations))),
         "observation": rng.normal(size=(environments, shape.observations)),
         "noise": rng.normal(size=(environments, shape.actions)),
     }

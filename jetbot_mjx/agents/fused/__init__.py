@@ -27,11 +27,17 @@ On CPUs:
 - `cpu_network`: a stage that takes rows through a network, and its forward pass
 - `cpu_actions`: the calls that draw the actions of all environments, for one step or for all
   steps of an unroll
-- `cpu_gradient`: the stages of the gradient, one for each network and the sum
+- `cpu_gradient`: the stages of the gradient: of the value network, of the policy, and the sum
 - `cpu_adam`: the stages of Adam, and all minibatches as one call
 - `launch_cpu`: their launch
 
 For web pages:
 
 - `web`: the kernels of CPUs as WebAssembly, and what a script must know of them
+
+What the work is divided into, from the largest to the smallest:
+
+- GPU: launch > replica > network > block > tile of rows > warp > lane
+- CPU: call > minibatch > stage > part of one replica (a block of `xla_call.ll`) > tile of rows >
+  group of as many rows as a vector has lanes
 """

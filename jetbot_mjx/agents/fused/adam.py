@@ -5,8 +5,9 @@ Equation, with the gradient g clipped to a global norm, as `optax.adam` has it:
     m' = β₁ m + (1 - β₁) g,    v' = β₂ v + (1 - β₂) g²
     p' = p - η (m' / (1 - β₁ⁿ)) / (√(v' / (1 - β₂ⁿ)) + 10⁻⁸)
 
-for the n-th step, of size η. A step whose gradient is not finite is left out. The powers of β are
-carried from step to step.
+for the n-th step, of size η. The moments, m (`mu`) and v (`nu`), are moving averages of the
+gradients and of their squares, and 1 / (1 - βⁿ) corrects the bias of their beginning at zero. A
+step whose gradient is not finite is left out. The powers of β are carried from step to step.
 
 `cpu_adam` and `gpu_adam` lower `factors` and `element` for a kernel.
 """
@@ -40,10 +41,10 @@ class AdamRule(NamedTuple):
     schedule: str
     """One of `ppo.learning_rate_schedule`."""
     steps: int
-    """Number of steps of a training step."""
+    """Steps of Adam, which are minibatches, in a training step."""
 
     @property
-    def places(self) -> list[int]:
+    def metric_places(self) -> list[int]:
         """Return where the gradient's vector has the sums of `METRICS`."""
         ends = [(self.shape.policy_size, POLICY_METRICS), (self.shape.size, VALUE_METRICS)]
         return [end - len(names) + i for end, names in ends for i in range(len(names))]
@@ -52,16 +53,16 @@ class AdamRule(NamedTuple):
 class AdamTerms(NamedTuple):
     """An `AdamTerms` holds what does not change during a training step.
 
-    The kernels read them from an array, because they may differ between policies.
+    The kernels read them from an array, because replicas may have different ones.
     """
 
     max_grad_norm: Scalar
     learning_rate: Scalar
     """Size of the first step of all, for the schedule `LINEAR`."""
-    begun: Scalar
-    """Part of all steps of the training that were done before this training step."""
-    share: Scalar
-    """Part of all steps of the training that one step makes up."""
+    fraction_done: Scalar
+    """Fraction of the training's steps that were made before this training step."""
+    fraction_per_step: Scalar
+    """Fraction of the training's steps that one step is."""
     desired_kl: Scalar
     min_rate: Scalar
     max_rate: Scalar
@@ -76,11 +77,12 @@ class Progress(NamedTuple):
     """Power of β₁ whose exponent is the number of steps."""
     power_2: Scalar
     sums: Sequence[Scalar]
-    """Sums of each of the `METRICS` over all samples of all steps so far."""
+    """Sums of each of the `METRICS` over the samples of all steps of this training step so far, but
+    for those that were left out."""
     rates: Scalar
-    """Sum of the step sizes."""
+    """Sum of the sizes of these steps."""
     applied: Scalar
-    """Number of steps of this training step."""
+    """Number of these steps."""
 
 
 class Factors(NamedTuple):
@@ -91,9 +93,9 @@ class Factors(NamedTuple):
     clipping: Array
     """What the gradient is multiplied by."""
     rate: Array
-    inverse_1: Array
+    correction_1: Array
     """1 / (1 - β₁ⁿ)."""
-    inverse_2: Array
+    correction_2: Array
 
 
 SIZES = {"adam_terms": len(AdamTerms._fields), "progress": len(Progress._fields) - 1 + len(METRICS)}
@@ -134,45 +136,45 @@ def factors(
       terms: an array of `AdamTerms`.
       rule: what the vectors hold.
     """
-    given = AdamTerms(*(terms[i] for i in range(SIZES["adam_terms"])))
+    settings = AdamTerms(*(terms[i] for i in range(SIZES["adam_terms"])))
     rate, power_1, power_2, *rest = (progress[i] for i in range(SIZES["progress"]))
     old = Progress(rate, power_1, power_2, rest[: len(METRICS)], *rest[len(METRICS) :])
     # Clip the gradient to its norm, and leave the step out if that is not finite.
     norm = jnp.sqrt(square)
     is_applied = jnp.isfinite(norm)
-    clipping = jnp.where(norm < given.max_grad_norm, 1.0, given.max_grad_norm / norm)
+    clipping = jnp.where(norm < settings.max_grad_norm, 1.0, settings.max_grad_norm / norm)
     # The step size by its schedule.
     if rule.schedule == "LINEAR":
-        done = given.begun + old.applied * given.share
-        rate = given.learning_rate * (1.0 - jnp.minimum(done, 1.0))
+        fraction = settings.fraction_done + old.applied * settings.fraction_per_step
+        rate = settings.learning_rate * (1.0 - jnp.minimum(fraction, 1.0))
     elif rule.schedule == "ADAPTIVE_KL":
         divergence = metrics[METRICS.index("kl")] * (1.0 / rule.samples)
-        slower = jnp.maximum(given.min_rate, rate / 1.5)
-        rate = jnp.where(divergence > 2.0 * given.desired_kl, slower, rate)
-        faster = jnp.minimum(given.max_rate, rate * 1.5)
-        is_small = (divergence < 0.5 * given.desired_kl) & (divergence > 0.0)
+        slower = jnp.maximum(settings.min_rate, rate / 1.5)
+        rate = jnp.where(divergence > 2.0 * settings.desired_kl, slower, rate)
+        faster = jnp.minimum(settings.max_rate, rate * 1.5)
+        is_small = (divergence < 0.5 * settings.desired_kl) & (divergence > 0.0)
         rate = jnp.where(is_small, faster, rate)
-    # The corrections of the means, which begin at zero.
+    # The bias corrections.
     power_1, power_2 = power_1 * BETA_1, power_2 * BETA_2
     is_one = jnp.where(is_applied, 1.0, 0.0)
-    inverses = 1.0 / (1.0 - power_1), 1.0 / (1.0 - power_2)
-    common = Factors(is_one, clipping, rate, *inverses)
+    corrections = 1.0 / (1.0 - power_1), 1.0 / (1.0 - power_2)
+    common = Factors(is_one, clipping, rate, *corrections)
     # Count the step, unless it is left out: then its metrics may not be finite either.
     sums = [total + metrics[i] for i, total in enumerate(old.sums)]
     new = Progress(rate, power_1, power_2, sums, old.rates + rate, old.applied + 1.0)
-    kept = [jnp.where(is_applied, *x) for x in zip(jax.tree.leaves(new), progress, strict=True)]
-    return common, jnp.stack(kept)
+    pairs = zip(jax.tree.leaves(new), progress, strict=True)
+    return common, jnp.stack([jnp.where(is_applied, *pair) for pair in pairs])
 
 
 def element(
     param: Array, mu: Array, nu: Array, gradient: Array, common: Factors
 ) -> tuple[Array, ...]:
-    """Return the next parameter and means of one element, or of many.
+    """Return the next parameter and moments of one element, or of many.
 
     Args:
       param: the parameter.
-      mu: mean of its gradients.
-      nu: mean of their squares.
+      mu: the first moment.
+      nu: the second moment.
       gradient: the gradient.
       common: what the elements have in common.
     """
@@ -180,8 +182,8 @@ def element(
     clipped = gradient * common.clipping
     new_mu = BETA_1 * mu + (1.0 - BETA_1) * clipped
     new_nu = BETA_2 * nu + (1.0 - BETA_2) * (clipped * clipped)
-    change = common.rate * (new_mu * common.inverse_1)
-    change = change / (jnp.sqrt(new_nu * common.inverse_2) + _EPSILON)
+    change = common.rate * (new_mu * common.correction_1)
+    change = change / (jnp.sqrt(new_nu * common.correction_2) + _EPSILON)
     # Or what it was, if the step is left out.
     pairs = (param - change, param), (new_mu, mu), (new_nu, nu)
     return tuple(jnp.where(common.is_applied > 0.0, *pair) for pair in pairs)

@@ -10,12 +10,12 @@ from jax.core import ShapedArray
 from jaxtyping import Array, Float
 
 from jetbot_mjx.agents.fused.adam import SIZES, AdamRule
-from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch, Unroll, UpdateShape
+from jetbot_mjx.agents.fused.shapes import DataSizes, LossTerms, UnrollSpec, UpdateShape
 
 Arrays = Mapping[str, Array]
 """The arguments of a kernel by name, in its order."""
 
-Spec = UpdateShape | AdamRule | Unroll
+Spec = UpdateShape | AdamRule | UnrollSpec
 """The description for which a kernel is written."""
 
 AXES = {
@@ -23,7 +23,7 @@ AXES = {
     "params": "size",
     # Mean of the observations, and inverse of their standard deviations.
     "mean": "obs",
-    "scale": "obs",
+    "inverse_std": "obs",
     # The observations on which the actions of one step are drawn, and the noise of these.
     "observations": "environments obs",
     "action_noise": "environments action",
@@ -33,15 +33,14 @@ AXES = {
     # The collected steps, by `UpdateShape.columns`, and the observations after the last ones.
     "rows": "collected time columns",
     "last": "collected obs",
-    # The unrolls of all minibatches, as indices of the collected ones, and the noise that
-    # estimates the entropy.
-    "unrolls": "minibatches unrolls",
+    # Which of the collected unrolls each minibatch has, and the noise that estimates the entropy.
+    "unroll_indices": "minibatches unrolls",
     "noise": "minibatches time unrolls action",
     # The minibatch, which is also the step of Adam.
     "index": "",
     # The coefficients of the loss, an array of `LossTerms`.
     "terms": "terms",
-    # The gradient, with the sums of the metrics at their places; its mean, and that of its squares.
+    # The gradient, with the sums of the metrics at their places, and the moments of Adam.
     "gradient": "size",
     "mu": "size",
     "nu": "size",
@@ -49,8 +48,9 @@ AXES = {
     "progress": "steps+1 progress",
     "adam_terms": "adam_terms",
 }
-"""The axes of each argument for one policy. `unrolls` and `index` are int32, the others float32;
-noise is standard normal."""
+"""The axes of each argument for one replica: one of several trainings that run at once, as those of
+`--seeds` or of a search. `unroll_indices` and `index` are int32, the others float32; noise is
+standard normal."""
 
 
 class Actions(NamedTuple):
@@ -71,53 +71,58 @@ class Signature:
 
     name: str
     arguments: tuple[str, ...]
-    """Names among `AXES`, in the order of the arguments."""
+    """Names among `AXES`, in the order of the arguments. The first has one axis, so that all axes
+    in front of it are replicas."""
     returns: Mapping[str, str]
     """The axes of each result; those with the name of an argument take its place in memory."""
 
     @property
     def aliases(self) -> dict[int, int]:
         """Return the places of the arguments that the kernel changes, with those of the results."""
-        given = self.arguments
-        return {given.index(x): i for i, x in enumerate(self.returns) if x in given}
+        places = {name: i for i, name in enumerate(self.arguments)}
+        return {places[name]: i for i, name in enumerate(self.returns) if name in places}
 
-    def batch_of(self, spec: Spec, arrays: Sequence[Array | ShapedArray]) -> Minibatch:
-        """Return how much data there is, and refuse what a kernel would read beyond its end.
+    def replica_axes(self, arrays: Sequence[Array | ShapedArray]) -> tuple[int, ...]:
+        """Return the lengths of the axes that `jax.vmap` has put in front of the arguments."""
+        return arrays[0].shape[:-1]
+
+    def batch_of(self, spec: Spec, arrays: Sequence[Array | ShapedArray]) -> DataSizes:
+        """Return the sizes of the data, and refuse what a kernel would read beyond its end.
 
         Args:
           spec: the description for which the kernel is written.
-          arrays: its arguments, with any axes of policies in front.
+          arrays: its arguments, with any axes in front that `replica_axes` returns.
 
         Raises:
           TypeError: an argument has another dtype or shape.
         """
-        lengths, batch = _lengths(spec), arrays[0].shape[:-1]
+        lengths, replicas = _lengths(spec), self.replica_axes(arrays)
         for name, x in zip(self.arguments, arrays, strict=True):
-            dtype = np.dtype(np.int32 if name in ("unrolls", "index") else np.float32)
-            axes, shape = AXES[name].split(), x.shape[len(batch) :]
+            dtype = np.dtype(np.int32 if name in ("unroll_indices", "index") else np.float32)
+            axes, shape = AXES[name].split(), x.shape[len(replicas) :]
             # The first array with an axis of the data says how long it is.
             wanted = tuple(lengths.setdefault(*axis) for axis in zip(axes, shape, strict=False))
-            if len(axes) != len(shape) or x.shape != (*batch, *wanted) or x.dtype != dtype:
-                said = f"{name} is {x}, not {dtype} of {batch} and {axes}: {lengths}"
+            if len(axes) != len(shape) or x.shape != (*replicas, *wanted) or x.dtype != dtype:
+                said = f"{name} is {x}, not {dtype} of {replicas} and {axes}: {lengths}"
                 raise TypeError(f"{self.name}: {said}")
         samples = lengths.get("unrolls", 0) * lengths.get("time", 0)
         if isinstance(spec, AdamRule) and samples not in (0, spec.samples):
             raise TypeError(f"{self.name}: a minibatch of {samples} samples does not fit {spec}")
-        return self.relevant(Minibatch(*(lengths.get(x, 0) for x in Minibatch._fields)))
+        return self.relevant(DataSizes(*(lengths.get(x, 0) for x in DataSizes._fields)))
 
-    def relevant(self, batch: Minibatch) -> Minibatch:
-        """Return what of the data the kernel's arguments tell, and zeros for the rest."""
+    def relevant(self, batch: DataSizes) -> DataSizes:
+        """Return the sizes that the kernel depends on, and zeros for the others."""
         axes = {axis for name in self.arguments for axis in AXES[name].split()}
-        return Minibatch(**{x: n if x in axes else 0 for x, n in batch._asdict().items()})
+        return DataSizes(**{x: n if x in axes else 0 for x, n in batch._asdict().items()})
 
-    def shapes(self, spec: Spec, batch: Minibatch) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of all arguments and results for one policy, by name."""
+    def shapes(self, spec: Spec, batch: DataSizes) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of all arguments and results for one replica, by name."""
         lengths = batch._asdict() | _lengths(spec)
         axes = {name: AXES[name] for name in self.arguments} | dict(self.returns)
         return {name: tuple(lengths[x] for x in axes[name].split()) for name in axes}
 
-    def counts(self, spec: Spec, batch: Minibatch) -> dict[str, int]:
-        """Return the numbers of one policy in each argument and result, by name."""
+    def counts(self, spec: Spec, batch: DataSizes) -> dict[str, int]:
+        """Return the numbers of one replica in each argument and result, by name."""
         return {name: math.prod(shape) for name, shape in self.shapes(spec, batch).items()}
 
 
@@ -129,7 +134,7 @@ def _lengths(spec: Spec) -> dict[str, int]:
     lengths |= {"terms": len(LossTerms._fields), **SIZES}
     if isinstance(spec, AdamRule):
         lengths |= {"minibatches": spec.steps, "steps+1": spec.steps + 1}
-    if isinstance(spec, Unroll):
+    if isinstance(spec, UnrollSpec):
         lengths |= {"state": spec.state, "kept": len(spec.kept)}
         # The kernel writes the next state in the place of the one before.
         if [x.shape for x in spec.kernel.results()] != [(spec.state,)]:
@@ -137,16 +142,16 @@ def _lengths(spec: Spec) -> dict[str, int]:
     return lengths
 
 
-# The kernels. Their first arguments are those of a network.
+# The kernels.
 
-_NETWORK = ("params", "mean", "scale")
-_DATA = ("rows", "last", "unrolls", "noise")
-_EACH = dict.fromkeys(Actions._fields, "environments action")
-_EACH |= {"log_prob": "environments", "distribution_params": "environments 2*action"}
-_STEPS = {name: f"time {axes}" for name, axes in _EACH.items()}
+_NETWORK = ("params", "mean", "inverse_std")
+_DATA = ("rows", "last", "unroll_indices", "noise")
+_ACTIONS = dict.fromkeys(Actions._fields, "environments action")
+_ACTIONS |= {"log_prob": "environments", "distribution_params": "environments 2*action"}
+_STEPS = {name: f"time {axes}" for name, axes in _ACTIONS.items()}
 _UPDATED = {name: AXES[name] for name in ("params", "mu", "nu", "progress")}
 
-ACTIONS = Signature("actions", (*_NETWORK, "observations", "action_noise"), _EACH)
+ACTIONS = Signature("actions", (*_NETWORK, "observations", "action_noise"), _ACTIONS)
 UNROLL = Signature(
     "unroll",
     (*_NETWORK, "start", "unroll_noise"),

@@ -12,7 +12,7 @@ from jetbot_mjx.agents.fused.arrays import ACTIONS, Actions
 from jetbot_mjx.agents.fused.cpu_network import HEAD, MOST_PARTS, TILE_ROWS, NetworkStage
 from jetbot_mjx.agents.fused.cpu_stages import sample_function
 from jetbot_mjx.agents.fused.sample_loss import vector_of
-from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
+from jetbot_mjx.agents.fused.shapes import DataSizes, UnrollSpec, UpdateShape
 from onekernel.build import LlvmWriter, Value, cpu, scalarize
 
 
@@ -24,7 +24,7 @@ class ActionStage(NetworkStage):
     part_rows = 2 * TILE_ROWS
     """Environments of a part, unless there would be too many parts; each copies the weights."""
 
-    def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
+    def __init__(self, shape: UpdateShape, batch: DataSizes, lanes: int) -> None:
         """Divide the environments.
 
         Args:
@@ -32,8 +32,8 @@ class ActionStage(NetworkStage):
           batch: the data, of which the number of environments is used.
           lanes: the number of float32 values in a vector register.
         """
-        numbers = ACTIONS.counts(shape, Minibatch(environments=1))
-        self.drawn = {name: numbers[name] for name in Actions._fields}
+        numbers = ACTIONS.counts(shape, DataSizes(environments=1))
+        self.result_sizes = {name: numbers[name] for name in Actions._fields}
         """The numbers of an environment in each array of `Actions`."""
         part_items = max(self.part_rows, -(-batch.environments // MOST_PARTS))
         super().__init__(shape, lanes, batch.environments, part_items)
@@ -41,17 +41,17 @@ class ActionStage(NetworkStage):
     def scratch_sizes(self) -> dict[str, int]:
         """Add what the samples read and write, a row of lanes for each number."""
         reads = self.outputs + 2 * self.shape.actions
-        sizes = {"sample": reads * self.lanes, "drawn": sum(self.drawn.values()) * self.lanes}
+        writes = sum(self.result_sizes.values())
+        sizes = {"sample": reads * self.lanes, "results": writes * self.lanes}
         return super().scratch_sizes() | sizes
 
     def own_functions(self) -> list[LlvmWriter]:
         """Write the activation and the sample."""
         name = self.shape.activation
         activated = scalarize(lambda z: sample_loss.activation(name, z)[0], vector_of())
-        drawn = sample_loss.action_program(self.shape)
         return [
             self.on_layers("activate", activated, (0,), (0,)),
-            sample_function("draw", drawn, self.lanes),
+            sample_function("draw", sample_loss.action_program(self.shape), self.lanes),
         ]
 
     def tile(self, first: Value, count: Value) -> None:
@@ -75,7 +75,7 @@ class ActionStage(NetworkStage):
         self.forward(self.stored_rows(count))
         # and draw the actions, a lane for each environment.
         places, actions = self.places, self.shape.actions
-        for start in self.groups(count):
+        with self.groups(count) as start:
             there = w.minimum(count - start, w.lanes)
             # Collect what the samples read; lanes beyond the last environment repeat it.
             with w.loop(w.lanes) as lane:
@@ -84,15 +84,15 @@ class ActionStage(NetworkStage):
                 noise = arrays["action_noise"] + (first + row) * actions
                 sources = (outputs, self.outputs), (self.deviations, actions), (noise, actions)
                 self.gather("sample", lane, sources)
-            w.call("draw", places["sample"], places["drawn"])
-            # Store what they draw, the numbers of each array behind those of the one before.
+            w.call("draw", places["sample"], places["results"])
+            # Store the actions, the numbers of each array behind those of the one before.
             with w.loop(there) as lane:
-                drawn = places["drawn"] + lane
-                for name, size in self.drawn.items():
+                results = places["results"] + lane
+                for name, size in self.result_sizes.items():
                     target = arrays[name] + (first + start + lane) * size
                     for i in range(size):
-                        target[i] = drawn[i * w.lanes]
-                    drawn += size * w.lanes
+                        target[i] = results[i * w.lanes]
+                    results += size * w.lanes
 
 
 class UnrollStage(ActionStage):
@@ -102,7 +102,7 @@ class UnrollStage(ActionStage):
     # The parts are smaller than those of one step: each arranges the weights for all steps.
     part_rows = TILE_ROWS
 
-    def __init__(self, unroll: Unroll, batch: Minibatch, lanes: int) -> None:
+    def __init__(self, unroll: UnrollSpec, batch: DataSizes, lanes: int) -> None:
         """Divide the environments.
 
         Args:
@@ -125,14 +125,14 @@ class UnrollStage(ActionStage):
             # Find the step's part of each array, and the states before it.
             here = {
                 name: self.arrays[name] + step * (self.sizes[name] // self._time)
-                for name in ("kept", "unroll_noise", *self.drawn)
+                for name in ("kept", "unroll_noise", *self.result_sizes)
             }
             before = w.select(step.equals(0), self.arrays["start"], end)
             here["observations"] = before + unroll.observation
             here["action_noise"] = here["unroll_noise"]
             # Draw the actions, and step the environments.
             self.act(first, count, here, unroll.state)
-            for start in self.groups(count):
+            with self.groups(count) as start:
                 w.call("instances", before, here["action"], end, first + start, limit)
             # Copy what is kept of the states.
             with w.loop(count) as row:

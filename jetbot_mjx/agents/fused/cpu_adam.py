@@ -15,13 +15,13 @@ from jetbot_mjx.agents.fused.cpu_stages import (
     VectorStage,
     sample_function,
 )
-from jetbot_mjx.agents.fused.shapes import Minibatch
+from jetbot_mjx.agents.fused.shapes import DataSizes
 from onekernel.build import LlvmWriter, ScalarProgram, run_program
 
 _VECTORS = ("params", "mu", "nu", "gradient")
 
 
-def adam_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> list[list[Stage]]:
+def adam_stages(rule: AdamRule, batch: DataSizes, lanes: int) -> list[list[Stage]]:
     """Return the stages of `arrays.ADAM`.
 
     Args:
@@ -33,7 +33,7 @@ def adam_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> list[list[Stage
     return [[SquareStage(rule.shape, lanes)], [_AdamStage(rule, lanes)]]
 
 
-def update_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> list[list[Stage]]:
+def update_stages(rule: AdamRule, batch: DataSizes, lanes: int) -> list[list[Stage]]:
     """Return the stages of `arrays.UPDATE`, through which the call goes for each minibatch.
 
     Args:
@@ -64,15 +64,15 @@ class _AdamStage(VectorStage):
         rule, lanes = self.rule, self.lanes
         factors, element = adam.programs(rule)
         elements = [_elements_function(element, n) for n in (lanes, 1)]
-        w, (job, policy, part, minibatch, scratch) = self.begin(lanes)
+        w, (job, replica, part, minibatch, scratch) = self.begin(lanes)
         names = *_VECTORS, "progress", "adam_terms", "squares"
-        *vectors, rows, terms, squares = (call.array(job, policy, name) for name in names)
+        *vectors, rows, terms, squares = (call.array(job, replica, name) for name in names)
         # What `factors` reads: the sum of squares, the metrics, the progress, and the terms.
         reads, writes = scratch, scratch + self.writes
         reads.store(0.0)
         add_all(squares, self.parts, reads)
         before = rows + minibatch * SIZES["progress"]
-        sources = [vectors[-1] + place for place in rule.places]
+        sources = [vectors[-1] + place for place in rule.metric_places]
         sources += [before + i for i in range(SIZES["progress"])]
         sources += [terms + i for i in range(SIZES["adam_terms"])]
         for i, source in enumerate(sources, start=1):

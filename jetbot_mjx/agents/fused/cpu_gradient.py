@@ -1,9 +1,9 @@
-"""Write the kernels that compute PPO's gradient on CPUs, one for each network.
+"""Write the stages of a call that compute PPO's gradient on CPUs, one for each network.
 
-A kernel divides the minibatch into parts of whole unrolls. A part goes through its unrolls tile by
-tile: forward through all layers, the loss and its derivatives by the outputs, and backward, where
-it adds to the part's gradient. Since a column of ones stands beside the activations, one product
-adds to the gradient of weights and biases.
+A stage divides the minibatch into parts of whole unrolls. A part goes through its unrolls tile by
+tile: forward through all layers, the loss and its derivatives with respect to the outputs, and
+backward, where it adds to the part's gradient. Since a column of ones stands beside the
+activations, one product adds to the gradient of weights and biases.
 """
 
 import abc
@@ -16,20 +16,20 @@ from jetbot_mjx.agents.fused.cpu_product import (
     add_all,
     add_to,
     fill,
-    multiply,
+    matmul,
     transposed,
-    vectors_of,
+    vector_loops,
 )
 from jetbot_mjx.agents.fused.cpu_stages import Stage, SumStage, integer_at, sample_function
 from jetbot_mjx.agents.fused.sample_loss import ValueStep, vector_of
-from jetbot_mjx.agents.fused.shapes import VALUE_METRICS, LossTerms, Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.shapes import VALUE_METRICS, DataSizes, LossTerms, UpdateShape
 from onekernel.build import LlvmWriter, ScalarProgram, Value, scalarize
 
 _PART_SAMPLES = 256
 """Samples of a part, about, if the minibatch has no more than `MOST_PARTS` times as many."""
 
 
-def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> list[list[Stage]]:
+def gradient_stages(shape: UpdateShape, batch: DataSizes, lanes: int) -> list[list[Stage]]:
     """Return the stages of `arrays.GRADIENT`, from values to the sum of all parts.
 
     Args:
@@ -49,15 +49,16 @@ class _GradientStage(NetworkStage):
 
         turned1, turned2, ...  (width, width), weights transposed
         turned_head            (outputs, width)
-        slopes1, slopes2, ...  (rows of a tile, width), derivatives of the activations
-        deltas0, deltas1       (rows, width), derivatives of the loss before an activation
-        errors                 (rows, HEAD), derivatives of the loss by the outputs
+        slopes1, slopes2, ...  (rows of a tile, width), derivatives of the activation function
+        deltas0, deltas1       (rows, width), dL/dz: of the loss with respect to weighted sums
+        errors                 (rows, HEAD), dL/dy: of the loss with respect to the outputs
         head_sums              (width + 1, HEAD), the gradient of the last layer
-        sums                   (slots, lanes), those of the deviations and the metrics
+        tail_sums              (tail_sums, lanes), those of the deviations and the metrics
+        statistics             (lanes), sums of the advantages, for their mean and variance
         loss, results          (numbers of a sample, lanes), what its loss reads and writes
     """
 
-    slots: int
+    tail_sums: int
     """Number of sums behind the head's parameters."""
     size: int
     """Length of the network's part of the vector of parameters."""
@@ -66,7 +67,7 @@ class _GradientStage(NetworkStage):
     loss_lanes: int
     """Number of samples whose losses are computed at once."""
 
-    def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
+    def __init__(self, shape: UpdateShape, batch: DataSizes, lanes: int) -> None:
         # A tile has whole unrolls, of the values each followed by its last observation.
         self.batch = batch
         unrolls = max(1, round(_PART_SAMPLES / batch.time), -(-batch.unrolls // MOST_PARTS))
@@ -76,24 +77,26 @@ class _GradientStage(NetworkStage):
 
     def scratch_sizes(self) -> dict[str, int]:
         shape, stride, lanes, rows = self.shape, self.stride, self.lanes, self.rows
-        reads = 6 * shape.actions + self.outputs + 3 + len(LossTerms._fields)
+        reads, writes = (
+            sum(array.size for array in arrays) * self.loss_lanes
+            for arrays in (self.loss_program.inputs, self.loss_program.outputs)
+        )
         sizes = {f"turned{i}": shape.width * stride for i in range(1, shape.layers)}
         sizes["turned_head"] = self.outputs * stride
         sizes |= {f"slopes{i}": rows * stride for i in range(1, shape.layers + 1)}
         sizes |= dict.fromkeys(("deltas0", "deltas1"), rows * stride)
         sizes |= {"errors": rows * HEAD, "head_sums": (shape.width + 1) * HEAD}
-        sizes |= {"sums": self.slots * lanes, "statistics": lanes, "loss": reads * lanes}
-        sizes |= {"results": (HEAD + self.slots) * lanes}
-        return super().scratch_sizes() | sizes
+        sizes |= {"tail_sums": self.tail_sums * lanes, "statistics": lanes}
+        return super().scratch_sizes() | sizes | {"loss": reads, "results": writes}
 
     def own_functions(self) -> list[LlvmWriter]:
         scalar = vector_of()
         activation = functools.partial(sample_loss.activation, self.shape.activation)
         activated, both = scalarize(activation, scalar), (0, 1)
-        scaled = scalarize(lambda one, other: one * other, scalar, scalar)
+        product = scalarize(lambda one, other: one * other, scalar, scalar)
         return [
             self.on_layers("activate", activated, (0,), both),
-            self.on_layers("multiply", scaled, both, (0,)),
+            self.on_layers("scale_by_slopes", product, both, (0,)),
             sample_function(f"{self.name}_loss", self.loss_program, self.loss_lanes),
         ]
 
@@ -101,19 +104,19 @@ class _GradientStage(NetworkStage):
     def add_losses(self, first: Value, count: Value) -> None:
         """Write the errors of a tile, and add to the sums."""
 
-    def load_terms(self) -> list[Value]:
+    def load_terms(self) -> LossTerms[Value]:
         """Return the coefficients of the loss."""
-        return [self.arrays["terms"][i] for i in range(len(LossTerms._fields))]
+        return LossTerms(*(self.arrays["terms"][i] for i in range(len(LossTerms._fields))))
 
     def row_of(self, unroll: Value, step: Value) -> Value:
         """Return the address of the collected row of a step."""
         # The minibatch's unrolls are some of the collected ones.
-        sample = self.collected(unroll) * self.batch.time + step
-        return self.arrays["rows"] + sample * self.shape.columns["size"]
+        collected_step = self.collected(unroll) * self.batch.time + step
+        return self.arrays["rows"] + collected_step * self.shape.columns["size"]
 
     def collected(self, unroll: Value) -> Value:
         """Return the index of an unroll of the minibatch among the collected ones."""
-        return integer_at(self.arrays["unrolls"] + unroll)
+        return integer_at(self.arrays["unroll_indices"] + unroll)
 
     def begin_part(self) -> None:
         super().begin_part()
@@ -121,7 +124,7 @@ class _GradientStage(NetworkStage):
         self.vector = self.arrays[f"{self.name}_vectors"] + self.part.number * self.size
         # Find the unrolls and the noise of the minibatch.
         noise = self.batch.samples * shape.actions
-        for name, size in (("unrolls", self.batch.unrolls), ("noise", noise)):
+        for name, size in (("unroll_indices", self.batch.unrolls), ("noise", noise)):
             self.arrays[name] += self.part.minibatch * size
         # Transpose the weights for the backward pass, and set all sums to zero.
         for i, inputs, start in shape.hidden_layers:
@@ -129,9 +132,9 @@ class _GradientStage(NetworkStage):
             fill(self.vector + start, (inputs + 1) * shape.width)
             if i:
                 self._transpose(source, places[f"turned{i}"], inputs, shape.width)
-        source = self.params + shape.hidden
+        source = self.params + shape.head_start
         self._transpose(source, places["turned_head"], shape.width, self.outputs)
-        for name in ("errors", "head_sums", "sums"):
+        for name in ("errors", "head_sums", "tail_sums"):
             fill(places[name], self.scratch_sizes()[name])
 
     def _transpose(self, source: Value, target: Value, rows: int, columns: int) -> None:
@@ -160,21 +163,25 @@ class _GradientStage(NetworkStage):
                 row = i * self.steps + step
                 self.load_observation(self.observation(unroll, step), row)
         self.forward(stored)
-        # The loss, and its derivatives by the outputs.
+        # The loss, and the errors: its derivatives dL/dy with respect to the outputs.
         self.add_losses(first, count)
-        # Backward: first the weights of a layer, and then the derivatives before it.
-        width, stride, layers = shape.width, self.stride, self.layers
+        # Backward: the gradient of the head's weights and biases, [activations, 1]ᵀ @ dL/dy.
+        width, stride, activations = shape.width, self.stride, self.activations
         errors, sums = Matrix(places["errors"], HEAD), Matrix(places["head_sums"], HEAD)
-        multiply(layers[-1].transposed, errors, sums, (width + 1, HEAD, rows), adds=True)
-        turned, length = places["turned_head"], self.outputs
+        matmul(activations[-1].transposed, errors, sums, (width + 1, HEAD, rows), adds=True)
+        following, turned, length = errors, "turned_head", self.outputs
         for i, inputs, start in reversed(shape.hidden_layers):
+            # dL/dz of this layer = (dL/dz of the next, or dL/dy, @ Wᵀ) · slopes; two buffers take
+            # turns.
             deltas = Matrix(places[f"deltas{i % 2}"], stride)
-            multiply(errors, Matrix(turned, stride), deltas, (stored, width, length))
-            w.call("multiply", deltas.start, places[f"slopes{i + 1}"], stored)
+            matmul(following, Matrix(places[turned], stride), deltas, (stored, width, length))
+            w.call("scale_by_slopes", deltas.start, places[f"slopes{i + 1}"], stored)
+            # The gradient of its weights and biases: [inputs, 1]ᵀ @ dL/dz.
             gradient = Matrix(self.vector + start, width)
             sizes = inputs + 1, width, rows
-            multiply(layers[i].transposed, deltas, gradient, sizes, adds=True)
-            errors, turned, length = deltas, places.get(f"turned{i}", turned), width
+            matmul(activations[i].transposed, deltas, gradient, sizes, adds=True)
+            # Layer 0 is the last, so there are no transposed weights of it.
+            following, turned, length = deltas, f"turned{i}", width
 
     def observation(self, unroll: Value, step: Value) -> Value:
         """Return the address of the observation of a step."""
@@ -185,11 +192,11 @@ class _GradientStage(NetworkStage):
         w, shape, outputs = self.w, self.shape, self.outputs
         with w.loop(shape.width + 1) as row, w.loop(outputs) as j:
             value = (self.places["head_sums"] + row * HEAD)[j]
-            (self.vector + shape.hidden + row * outputs)[j] = value
-        with w.loop(self.slots) as slot:
-            target = self.vector + (shape.hidden + (shape.width + 1) * outputs) + slot
+            (self.vector + shape.head_start + row * outputs)[j] = value
+        with w.loop(self.tail_sums) as i:
+            target = self.vector + (shape.head_start + (shape.width + 1) * outputs) + i
             target.store(0.0)
-            add_all(self.places["sums"] + slot * w.lanes, w.lanes, target)
+            add_all(self.places["tail_sums"] + i * w.lanes, w.lanes, target)
 
 
 class _ValueStage(_GradientStage):
@@ -198,8 +205,8 @@ class _ValueStage(_GradientStage):
     name = "values"
     is_policy = False
 
-    def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
-        self.slots, self.size = len(VALUE_METRICS), shape.size - shape.policy_size
+    def __init__(self, shape: UpdateShape, batch: DataSizes, lanes: int) -> None:
+        self.tail_sums, self.size = len(VALUE_METRICS), shape.size - shape.policy_size
         self.loss_program, self.loss_lanes = sample_loss.value_step_program(batch.samples), 1
         super().__init__(shape, batch, lanes)
         self.handed_on = {**self.handed_on, "advantages": batch.samples}
@@ -237,10 +244,10 @@ class _ValueStage(_GradientStage):
                 for place, name in enumerate(("reward", "discount", "truncation"), start=1):
                     reads[place] = source[columns[name]]
                 w.call("values_loss", reads, writes)
-                # Keep the advantage, the derivative by the value and the squared error.
+                # Store the advantage and the error, and add up the squared distance to the target.
                 self.arrays["advantages"][unroll * time + step] = writes[0]
                 errors[row] = writes[1]
-                add_to(places["sums"], writes[2])
+                add_to(places["tail_sums"], writes[2])
                 # The value, the target and the estimate are those after the step before.
                 for place in range(3):
                     reads[following + place] = writes[3 + place]
@@ -251,8 +258,8 @@ class _PolicyStage(_GradientStage):
 
     name = "policy"
 
-    def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
-        self.slots, self.size = shape.slots - shape.outputs[0], shape.policy_size
+    def __init__(self, shape: UpdateShape, batch: DataSizes, lanes: int) -> None:
+        self.tail_sums, self.size = shape.slots - shape.outputs[0], shape.policy_size
         self.loss_program = sample_loss.policy_program(shape, batch.samples)
         self.loss_lanes = lanes
         super().__init__(shape, batch, lanes)
@@ -264,7 +271,7 @@ class _PolicyStage(_GradientStage):
             # order: so none waits for another.
             self.mean = self._mean_advantage(None)
             variance = self._mean_advantage(self.mean)
-            self.scale = 1.0 / (self.w.intrinsic("sqrt", variance) + 1e-8)
+            self.inverse_std = 1.0 / (self.w.intrinsic("sqrt", variance) + 1e-8)
 
     def _mean_advantage(self, centre: Value | None) -> Value:
         """Return the mean of the advantages, or of their squared distances from a centre."""
@@ -272,12 +279,13 @@ class _PolicyStage(_GradientStage):
         total = self.places["statistics"]
         # A sum for each lane, and then one of all lanes.
         fill(total, lanes)
-        for place, kind in vectors_of(w.constant(0, "u64"), w.constant(samples, "u64")):
-            value = (self.arrays["advantages"] + place).load(kind)
-            if centre is not None:
-                distance = value - (centre if kind == "float" else centre.splat(lanes))
-                value = distance * distance
-            add_to(total, value)
+        for kind, loop in vector_loops(w.constant(0, "u64"), w.constant(samples, "u64")):
+            with loop as place:
+                value = (self.arrays["advantages"] + place).load(kind)
+                if centre is not None:
+                    distance = value - (centre if kind == "float" else centre.splat(lanes))
+                    value = distance * distance
+                add_to(total, value)
         add_all(total + 1, lanes - 1, total)
         return total[0] * (1 / samples)
 
@@ -285,20 +293,20 @@ class _PolicyStage(_GradientStage):
         """Compute the losses of as many samples at once as a vector has lanes."""
         w, lanes, places = self.w, self.lanes, self.places
         rows, results = count * self.batch.time, places["results"]
-        for start in self.groups(rows):
+        with self.groups(rows) as start:
             # Collect what the loss reads, sample by sample.
             with w.loop(lanes) as lane:
                 self._load_sample(lane, start + lane, rows, first)
             w.call("policy_loss", places["loss"], results)
-            # Store the derivatives by the outputs, and add up the sums behind them.
+            # Store the errors, and add up what is behind them: the tail.
             there = w.minimum(rows - start, lanes)
             with w.loop(there) as lane, w.loop(self.outputs) as j:
                 source = results + j * lanes + lane
                 places["errors"][(start + lane) * HEAD + j] = source.load()
-            with w.loop(self.slots) as slot:
-                place = slot * lanes
+            with w.loop(self.tail_sums) as i:
+                place = i * lanes
                 value = (results + self.outputs * lanes + place).load(w.vector)
-                add_to(places["sums"] + place, value)
+                add_to(places["tail_sums"] + place, value)
 
     def _load_sample(self, lane: Value, row: Value, rows: Value, first: Value) -> None:
         """Copy what the loss of a sample reads to a lane, in the order of `PolicySample`.
@@ -320,7 +328,7 @@ class _PolicyStage(_GradientStage):
         noise = self.arrays["noise"] + (step * batch.unrolls + unroll) * actions
         advantage = self.arrays["advantages"][unroll * batch.time + step]
         if shape.normalizes:
-            advantage = (advantage - self.mean) * self.scale
+            advantage = (advantage - self.mean) * self.inverse_std
         start, stop = columns["raw_action"], columns["reward"]
         sources = [
             (outputs, self.outputs),
@@ -329,4 +337,4 @@ class _PolicyStage(_GradientStage):
             (noise, actions),
         ]
         # The fields of `PolicySample`, one behind the other, and the coefficients.
-        self.gather("loss", lane, sources, advantage, weight, *self.load_terms())
+        self.gather("loss", lane, sources, [advantage, weight, *self.load_terms()])

@@ -7,9 +7,10 @@ A column of ones beside the activations has the biases as its weights, so that o
 a layer with its biases.
 """
 
+import contextlib
 from collections.abc import Iterator, Sequence
 
-from jetbot_mjx.agents.fused.cpu_product import ROWS, Matrix, fill, multiply, rounded_up
+from jetbot_mjx.agents.fused.cpu_product import ROWS, Matrix, fill, matmul, rounded_up
 from jetbot_mjx.agents.fused.cpu_stages import Call, Stage
 from jetbot_mjx.agents.fused.shapes import UpdateShape, places
 from onekernel.build import LlvmWriter, ScalarProgram, Value, run_program
@@ -57,7 +58,8 @@ class NetworkStage(Stage):
         """
         self.shape, self.lanes = shape, lanes
         self.items, self.part_items, self.steps = items, part_items, steps
-        self.outputs = shape.outputs[not self.is_policy]
+        of_policy, of_values = shape.outputs
+        self.outputs = of_policy if self.is_policy else of_values
         self.parts = -(-items // part_items)
         self.tile_items = min(part_items, -(-TILE_ROWS // steps))
         # The rows of a tile that are stored, and the strides of those of a layer.
@@ -119,9 +121,9 @@ class NetworkStage(Stage):
         """Write the function that computes one part, and those that it calls."""
         functions = self.own_functions()
         self.w, self.part = w, part = self.begin(self.lanes)
-        # Find the arrays of the policy, the network's parameters and the scratch memory.
+        # Find the arrays of the replica, the network's parameters and the scratch memory.
         self.sizes = call.sizes
-        self.arrays = {name: call.array(part.job, part.policy, name) for name in call.sizes}
+        self.arrays = {name: call.array(part.job, part.replica, name) for name in call.sizes}
         start = 0 if self.is_policy else self.shape.policy_size
         self.params = self.arrays["params"] + start
         self.places = {name: part.scratch + place for name, place in self.layout.items()}
@@ -150,7 +152,7 @@ class NetworkStage(Stage):
         # Those of the last layer, with zeros beyond its outputs.
         fill(places["head"], (width + 1) * HEAD)
         fill(places["layer0"], self.rows * self.first_stride)
-        source, outputs = self.params + shape.hidden, self.outputs
+        source, outputs = self.params + shape.head_start, self.outputs
         with w.loop(width + 1) as row, w.loop(outputs) as j:
             place, target = row * outputs + j, row * HEAD + j
             places["head"][target] = source[place]
@@ -163,8 +165,9 @@ class NetworkStage(Stage):
     def end_part(self) -> None:
         """Write what is known after the last tile."""
 
+    @contextlib.contextmanager
     def groups(self, count: Value) -> Iterator[Value]:
-        """Repeat what is appended for as many rows at once as a vector has lanes.
+        """Repeat what is appended inside for as many rows at once as a vector has lanes.
 
         Args:
           count: the number of rows.
@@ -179,10 +182,14 @@ class NetworkStage(Stage):
     @property
     def deviations(self) -> Value:
         """Return the address of the standard deviations that are parameters, or of any numbers."""
-        return self.params + (self.shape.hidden + (self.shape.width + 1) * self.outputs)
+        return self.params + (self.shape.head_start + (self.shape.width + 1) * self.outputs)
 
     def gather(
-        self, name: str, lane: Value, sources: Sequence[tuple[Value, int]], *others: Value
+        self,
+        name: str,
+        lane: Value,
+        sources: Sequence[tuple[Value, int]],
+        others: Sequence[Value] = (),
     ) -> None:
         """Copy what a function of single samples reads to a lane, a number to each row.
 
@@ -190,7 +197,7 @@ class NetworkStage(Stage):
           name: the array of scratch memory that it reads, of shape (numbers, lanes).
           lane: the lane.
           sources: addresses, and how many numbers there.
-          *others: the numbers behind these.
+          others: the numbers behind these.
         """
         numbers = [source[i] for source, count in sources for i in range(count)]
         for i, number in enumerate([*numbers, *others]):
@@ -202,14 +209,15 @@ class NetworkStage(Stage):
 
     def load_observation(self, source: Value, row: Value) -> None:
         """Copy a normalised observation to a row of the tile."""
-        # (observation - mean) / std, with 1 / std as `scale`.
+        # (observation - mean) / std.
         target = self.places["layer0"] + row * self.first_stride
         with self.w.loop(self.shape.observations) as i:
-            value, mean, scale = source[i], self.arrays["mean"][i], self.arrays["scale"][i]
-            target[i] = (value - mean) * scale
+            value, mean = source[i], self.arrays["mean"][i]
+            inverse_std = self.arrays["inverse_std"][i]
+            target[i] = (value - mean) * inverse_std
 
     @property
-    def layers(self) -> list[Matrix]:
+    def activations(self) -> list[Matrix]:
         """Return the observations and the activations of each hidden layer."""
         strides = [self.first_stride, *[self.stride] * self.shape.layers]
         return [Matrix(self.places[f"layer{i}"], stride) for i, stride in enumerate(strides)]
@@ -220,13 +228,13 @@ class NetworkStage(Stage):
         Args:
           stored: the number of rows, from `stored_rows`.
         """
-        w, shape, places, layers = self.w, self.shape, self.places, self.layers
+        w, shape, places, activations = self.w, self.shape, self.places, self.activations
         none = Value(w, "null", "ptr")
         for i, inputs, _ in shape.hidden_layers:
             # The weighted sums with the biases, and then in their place the activations.
-            weights, after = Matrix(places[f"weights{i}"], self.stride), layers[i + 1]
-            multiply(layers[i], weights, after, (stored, shape.width, inputs + 1))
+            weights, after = Matrix(places[f"weights{i}"], self.stride), activations[i + 1]
+            matmul(activations[i], weights, after, (stored, shape.width, inputs + 1))
             w.call("activate", after.start, places.get(f"slopes{i + 1}", none), stored)
         # The last layer has no activation.
         head, outputs = Matrix(places["head"], HEAD), Matrix(places["outputs"], HEAD)
-        multiply(layers[-1], head, outputs, (stored, HEAD, shape.width + 1))
+        matmul(activations[-1], head, outputs, (stored, HEAD, shape.width + 1))

@@ -4,7 +4,9 @@ A product keeps a register tile of the result, four rows of a few vectors each, 
 column of the left matrix times one row of the right matrix to it at each step.
 """
 
-from collections.abc import Iterator, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 from onekernel.build import LlvmWriter, Value
@@ -12,7 +14,7 @@ from onekernel.build import LlvmWriter, Value
 ROWS = 4
 """Rows of a register tile."""
 
-_PRODUCT = "product"
+_MATMUL = "matmul"
 
 
 class Matrix(NamedTuple):
@@ -31,7 +33,7 @@ class Matrix(NamedTuple):
         return Matrix(self.start, self.column, self.row)
 
 
-def multiply(
+def matmul(
     left: Matrix,
     right: Matrix,
     result: Matrix,
@@ -55,11 +57,11 @@ def multiply(
         return x if isinstance(x, Value) else w.constant(x, "u64")
 
     places = [*left, *right[:2], *result[:2], *sizes]
-    w.call(_PRODUCT, *map(value, places), w.constant(adds, "i1"))
+    w.call(_MATMUL, *map(value, places), w.constant(adds, "i1"))
 
 
 def product_functions(lanes: int, registers: int) -> list[LlvmWriter]:
-    """Write the function that `multiply` calls, and those that it calls.
+    """Write the function that `matmul` calls, and those that it calls.
 
     Args:
       lanes: the number of float32 values in a vector register.
@@ -84,7 +86,7 @@ def _product_function(columns: int, lanes: int) -> LlvmWriter:
       lanes: the number of float32 values in a vector.
     """
     sizes = "u64 rows", "u64 columns", "u64 length", "i1 adds"
-    w = LlvmWriter(_PRODUCT, *_PARAMETERS, *sizes)
+    w = LlvmWriter(_MATMUL, *_PARAMETERS, *sizes)
     a, a_row, a_column, b, b_row, c, c_row, rows, width, length, adds = w.parameters
 
     def tile(height: int, vectors: int, row: Value, column: Value) -> None:
@@ -114,7 +116,7 @@ def _product_function(columns: int, lanes: int) -> LlvmWriter:
 
 
 def _tile_name(rows: int, columns: int) -> str:
-    return f"{_PRODUCT}.{rows}.{columns}"
+    return f"{_MATMUL}.{rows}.{columns}"
 
 
 def _tile_function(rows: int, columns: int, lanes: int) -> LlvmWriter:
@@ -164,25 +166,27 @@ def add_to(target: Value, value: Value) -> None:
     target.store(target.load(value.type) + value)
 
 
-def vectors_of(first: Value, count: Value) -> Iterator[tuple[Value, str]]:
-    """Repeat what is appended for all vectors of a range, and for all numbers that are left.
+def vector_loops(first: Value, count: Value) -> Iterator[tuple[str, AbstractContextManager[Value]]]:
+    """Yield the two loops that go through a range: over whole vectors, and over the numbers left.
 
     Args:
       first: the first number.
       count: how many there are.
 
     Yields:
-      Twice: the place of the vector or number, and its type.
+      The type of what the loop goes through, and the loop, which yields its place.
     """
     w = first.writer
-    # Whole vectors.
+
+    @contextlib.contextmanager
+    def loop(count: Value, place: Callable[[Value], Value]) -> Iterator[Value]:
+        with w.loop(count) as i:
+            yield place(i)
+
     whole = count // w.lanes
-    with w.loop(whole) as i:
-        yield first + i * w.lanes, w.vector
-    # Single numbers.
+    yield w.vector, loop(whole, lambda i: first + i * w.lanes)
     done = whole * w.lanes
-    with w.loop(count - done) as i:
-        yield first + (done + i), "float"
+    yield "float", loop(count - done, lambda i: first + (done + i))
 
 
 def rounded_up(number: Value, multiple: int) -> Value:

@@ -14,7 +14,13 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from jetbot_mjx.agents.fused.cpu_product import add_all, add_to, fill, product_functions, vectors_of
+from jetbot_mjx.agents.fused.cpu_product import (
+    add_all,
+    add_to,
+    fill,
+    product_functions,
+    vector_loops,
+)
 from jetbot_mjx.agents.fused.shapes import UpdateShape
 from onekernel.build import LlvmWriter, ScalarProgram, Value, cpu, run_program
 
@@ -27,7 +33,7 @@ class Part(NamedTuple):
 
     job: Value
     """Address of the call's job, which knows the arrays."""
-    policy: Value
+    replica: Value
     number: Value
     """Which of the parts of the stage."""
     minibatch: Value
@@ -35,18 +41,21 @@ class Part(NamedTuple):
     """Scratch memory of the thread."""
 
 
-_PARAMETERS = ("ptr job", "u64 policy", "u64 part", "u64 minibatch", "ptr scratch")
+_PARAMETERS = ("ptr job", "u64 replica", "u64 part", "u64 minibatch", "ptr scratch")
 
 
 @dataclasses.dataclass(frozen=True)
 class Call:
-    """A `Call` holds the arrays of a call and its stages."""
+    """A `Call` holds the arrays of a call and its stages.
+
+    XLA's threads take blocks: a block is one part of a stage, in one minibatch of one replica.
+    """
 
     arrays: tuple[str, ...]
     """Names of the arrays that XLA passes: the arguments, the results, and those between the
-    stages. Each has the policies as its first axis."""
+    stages. Each has the replicas as its first axis."""
     sizes: Mapping[str, int]
-    """Numbers of one policy in each array."""
+    """Numbers of one replica in each array."""
     stages: Sequence[Sequence["Stage"]]
     """The stages in their order. In place of one there may be several of as many parts: a part of
     the second follows that of the first, whose numbers are still in the cache."""
@@ -77,7 +86,7 @@ class Call:
 
     @property
     def blocks(self) -> int:
-        """Return the number of blocks of a policy."""
+        """Return the number of blocks of a replica."""
         return self._parts * self.minibatches
 
     @property
@@ -85,10 +94,10 @@ class Call:
         """Return the bytes of scratch memory of a thread, a multiple of 64."""
         return max(64 * -(-stage.scratch // 16) for together in self.stages for stage in together)
 
-    def array(self, job: Value, policy: Value, name: str) -> Value:
-        """Return the address of the array of a policy."""
+    def array(self, job: Value, replica: Value, name: str) -> Value:
+        """Return the address of the array of a replica."""
         place = self.arrays.index(name)
-        return cpu.array_of(job, place) + policy * self.sizes[name]
+        return cpu.array_of(job, place) + replica * self.sizes[name]
 
     @property
     def _parts(self) -> int:
@@ -101,38 +110,38 @@ class Call:
         return list(itertools.accumulate(parts, initial=0))[:-1]
 
     def _decoded(self, job: Value, index: Value) -> tuple[Value, Value, Value]:
-        """Return the policies, and of a block its minibatch and its place in that."""
-        policies = cpu.instance_count(job)
-        blocks = policies * self._parts
-        return policies, index // blocks, index % blocks
+        """Return the replicas, and of a block its minibatch and its place in that."""
+        replicas = cpu.instance_count(job)
+        blocks = replicas * self._parts
+        return replicas, index // blocks, index % blocks
 
     def _needed(self) -> LlvmWriter:
         """Write a function that returns how many blocks must have ended before a block begins."""
         w = LlvmWriter("needed", "ptr job", "u64 index", result="u64")
-        policies, minibatch, place = self._decoded(*w.parameters)
+        replicas, minibatch, place = self._decoded(*w.parameters)
         # All blocks of the stages before, and of the minibatches before.
         before = w.constant(0, "u64")
         for start in self._starts[1:]:
-            begins = policies * start
+            begins = replicas * start
             before = w.select(place >= begins, begins, before)
-        w.ret(minibatch * (policies * self._parts) + before)
+        w.ret(minibatch * (replicas * self._parts) + before)
         return w
 
     def _block(self) -> LlvmWriter:
         """Write the function that computes a block, by its index."""
         w = LlvmWriter("block", *cpu.BLOCK_PARAMETERS)
         job, index, scratch = w.parameters
-        policies, minibatch, place = self._decoded(job, index)
-        # Find the stage, and then the policy and the part of the stage.
+        replicas, minibatch, place = self._decoded(job, index)
+        # Find the stage, and then the replica and the part of the stage.
         for stages, start in zip(self.stages, self._starts, strict=True):
             parts = stages[0].parts
-            with w.when(place < policies * (start + parts)):
-                within = place - policies * start
-                policy, part = within // parts, within % parts
+            with w.when(place < replicas * (start + parts)):
+                within = place - replicas * start
+                replica, part = within // parts, within % parts
                 if "index" in self.arrays:
-                    minibatch = integer_at(self.array(job, policy, "index"))
+                    minibatch = integer_at(self.array(job, replica, "index"))
                 for stage in stages:
-                    w.call(stage.name, *Part(job, policy, part, minibatch, scratch))
+                    w.call(stage.name, *Part(job, replica, part, minibatch, scratch))
                 w.ret()
         return w
 
@@ -148,11 +157,11 @@ class Stage(abc.ABC):
     name: str
     """Name of the function."""
     parts: int
-    """Number of parts of a policy."""
+    """Number of parts of a replica."""
     scratch: int = 0
     """Numbers in the scratch memory of a thread, which is aligned to 64 bytes."""
     handed_on: Mapping[str, int] = {}
-    """Numbers of one policy in each array that it hands on to the stages behind it."""
+    """Numbers of one replica in each array that it hands on to the stages behind it."""
 
     @abc.abstractmethod
     def functions(self, call: Call) -> list[LlvmWriter]:
@@ -223,22 +232,23 @@ class SumStage(VectorStage):
 
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function."""
-        w, (job, policy, part, *_) = self.begin(self.lanes)
+        w, (job, replica, part, *_) = self.begin(self.lanes)
         # The array of each network has a vector for each part of its stage.
-        gradient, shape = call.array(job, policy, "gradient"), self.shape
+        gradient, shape = call.array(job, replica, "gradient"), self.shape
         ends = shape.policy_size, shape.size
         networks = zip(self._vectors.items(), shape.ranges, ends, strict=True)
         for (name, count), (begin, stop), end in networks:
-            vectors, size = call.array(job, policy, name), end - begin
+            vectors, size = call.array(job, replica, name), end - begin
             # The parameters, and the metrics behind them.
             for bounds in ((0, stop - begin), (stop - begin, size)):
-                for place, kind in vectors_of(*self.chunk(part, *bounds)):
-                    # An element's sum over the vectors of all parts, in their order.
-                    source = vectors + place
-                    total = source.load(kind)
-                    for i in range(1, count):
-                        total += (source + i * size).load(kind)
-                    (gradient + begin + place).store(total)
+                for kind, loop in vector_loops(*self.chunk(part, *bounds)):
+                    with loop as place:
+                        # An element's sum over the vectors of all parts, in their order.
+                        source = vectors + place
+                        total = source.load(kind)
+                        for i in range(1, count):
+                            total += (source + i * size).load(kind)
+                        (gradient + begin + place).store(total)
         return [w]
 
 
@@ -251,14 +261,15 @@ class SquareStage(VectorStage):
 
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function."""
-        w, (job, policy, part, _, scratch) = self.begin(self.lanes)
-        gradient, squares = (call.array(job, policy, name) for name in ("gradient", "squares"))
+        w, (job, replica, part, _, scratch) = self.begin(self.lanes)
+        gradient, squares = (call.array(job, replica, name) for name in ("gradient", "squares"))
         # A sum for each lane, and then one of all lanes.
         fill(scratch, self.lanes)
         for start, stop in self.shape.ranges:
-            for place, kind in vectors_of(*self.chunk(part, start, stop)):
-                value = (gradient + place).load(kind)
-                add_to(scratch, value * value)
+            for kind, loop in vector_loops(*self.chunk(part, start, stop)):
+                with loop as place:
+                    value = (gradient + place).load(kind)
+                    add_to(scratch, value * value)
         target = squares + part
         target.store(0.0)
         add_all(scratch, self.lanes, target)

@@ -6,8 +6,15 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Literal
 
 from jetbot_mjx.agents.fused.gpu_tiling import MOST_OUTPUTS, OUTPUT_STRIDE, PAD, Tiling, padded
-from jetbot_mjx.agents.fused.shapes import POLICY_METRICS, LossTerms, Minibatch
-from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, GpuKernel, GpuWriter, Operand, Sums
+from jetbot_mjx.agents.fused.shapes import POLICY_METRICS, DataSizes, LossTerms
+from jetbot_mjx.agents.fused.tensor_core import (
+    LANES,
+    TILE,
+    Accumulators,
+    GpuKernel,
+    GpuWriter,
+    Operand,
+)
 from onekernel.build import Value
 
 
@@ -21,25 +28,25 @@ class NetworkKernel(GpuKernel):
         layer0                   (rows of a tile, observations in whole tiles of 16), normalised
         layer1, layer2, ...      (rows, width), activations; without a backward pass only layer1
 
-    and of float32 the biases of each layer (width), the observations' mean and scale, and the
+    and of float32 the biases of each layer (width), the observations' mean and inverse_std, and the
     outputs (rows of a tile, MOST_OUTPUTS + 1).
     """
 
     def __init__(
-        self, shapes: Mapping[str, tuple[int, ...]], tiling: Tiling, batch: Minibatch, blocks: int
+        self, shapes: Mapping[str, tuple[int, ...]], tiling: Tiling, batch: DataSizes, blocks: int
     ) -> None:
         """Prepare to write.
 
         Args:
-          shapes: the shapes of all arrays for one policy.
+          shapes: the shapes of all arrays for one replica.
           tiling: the division of the work.
-          batch: the data of a policy.
+          batch: the sizes of the data.
           blocks: the number of blocks along the first axis of the grid.
         """
         super().__init__(shapes, blocks, tiling.threads, tiling.layout["size"])
         self.tiling, self.shape, self.batch = tiling, tiling.shape, batch
         self.stride = self.shape.width + PAD
-        self.first = padded(self.shape.observations)
+        self.padded_inputs = padded(self.shape.observations)
 
     def bytes_of(self, name: str) -> int:
         """Return the byte of shared memory where an array begins."""
@@ -47,11 +54,11 @@ class NetworkKernel(GpuKernel):
 
     def read(self, name: str, place: Value | int, offset: int = 0) -> Value:
         """Return a number of an array of float32 in shared memory."""
-        return self.ir.shared(place * 4, self.bytes_of(name) + 4 * offset).load()
+        return self.w.shared(place * 4, self.bytes_of(name) + 4 * offset).load()
 
     def write(self, name: str, place: Value | int, value: Value, offset: int = 0) -> None:
         """Write a number of an array of float32 in shared memory."""
-        self.ir.shared(place * 4, self.bytes_of(name) + 4 * offset).store(value)
+        self.w.shared(place * 4, self.bytes_of(name) + 4 * offset).store(value)
 
     def layer(self, number: int) -> str:
         """Return the name of a layer's activations; 0: the observations."""
@@ -59,12 +66,12 @@ class NetworkKernel(GpuKernel):
 
     def stride_of(self, name: str) -> int:
         """Return the float16 numbers from row to row of a matrix."""
-        special = {"layer0": self.first + PAD, "head": TILE + PAD, "errors": TILE + PAD}
+        special = {"layer0": self.padded_inputs + PAD, "head": TILE + PAD, "errors": TILE + PAD}
         return special.get(name, self.stride)
 
-    def load_terms(self) -> None:
-        """Load the coefficients of the loss."""
-        self.terms = LossTerms(*(self.arrays["terms"][i] for i in range(len(LossTerms._fields))))
+    def load_terms(self) -> LossTerms[Value]:
+        """Return the coefficients of the loss."""
+        return LossTerms(*(self.arrays["terms"][i] for i in range(len(LossTerms._fields))))
 
     @abc.abstractmethod
     def begin(self) -> list[Value]:
@@ -87,27 +94,27 @@ class NetworkKernel(GpuKernel):
 
     def text(self) -> str:
         """Return the module."""
-        ir, tiles = self.ir, self.tiling.tiles(self.batch)
+        w, tiles = self.w, self.tiling.tiles(self.batch)
         self._find_thread()
-        self.find_arrays(ir.register("ctaid.z"))
+        self.find_arrays(w.register("ctaid.z"))
         initial = self.begin()
-        ir.synchronize()
+        w.synchronize()
         # The blocks take the tiles in turns. A tile overwrites nothing that is read after the last
         # barrier of the one before.
-        with ir.repeat(self.block, *initial) as loop:
+        with w.repeat(self.block, *initial) as loop:
             tile, *carried = loop.carried
             carried = self.tile(tile, carried)
             # By no constant: where the assembler sees that a loop ends at once, it makes code with
             # more registers.
-            following = tile + ir.register("nctaid.x")
+            following = tile + w.register("nctaid.x")
             loop.again(following < tiles, following, *carried)
         self.end(carried)
-        return ir.module(self.threads)
+        return w.module(self.threads)
 
     def _find_thread(self) -> None:
         """Read the thread's place in the grid, and derive its places in the matrices."""
-        ir, tiling = self.ir, self.tiling
-        self.thread, self.block = ir.register("tid.x"), ir.register("ctaid.x")
+        w, tiling = self.w, self.tiling
+        self.thread, self.block = w.register("tid.x"), w.register("ctaid.x")
         lane, self.warp = self.thread % LANES, self.thread // LANES
         # Rows and columns of the matrices that a lane points `ldmatrix` at: see `tensor_core`.
         self.row_first = (lane % 16, lane // 16 * 8)
@@ -120,9 +127,9 @@ class NetworkKernel(GpuKernel):
         self.pairs = -(-pairs // tiling.column_groups)
         # The columns of the last warp may overlap those of the one before.
         column = self.warp % tiling.column_groups * self.pairs
-        self.column = ir.minimum(column, pairs - self.pairs) * TILE
+        self.column = w.minimum(column, pairs - self.pairs) * TILE
         # Where the lane's sums are in a layer's activations.
-        self.place = (self.row + self.sum_row) * (2 * self.stride) + (
+        self.own_bytes = (self.row + self.sum_row) * (2 * self.stride) + (
             self.column + self.sum_column
         ) * 2
 
@@ -130,7 +137,7 @@ class NetworkKernel(GpuKernel):
         self,
         side: Literal["left", "right"],
         name: str,
-        sums: Literal["rows", "columns"],
+        contracted: Literal["rows", "columns"],
         row: Value | int = 0,
         column: Value | int = 0,
     ) -> Operand:
@@ -139,22 +146,22 @@ class NetworkKernel(GpuKernel):
         Args:
           side: on which side of the product it stands.
           name: its name.
-          sums: what the product sums over: the columns of a left matrix, the rows of a right one,
-            or else those of its transpose.
+          contracted: what the product sums over, as the matrix lies in memory: `columns` of a left
+            matrix or `rows` of a right one; the other of a matrix whose transpose is multiplied.
           row: the first row in memory.
           column: the first column in memory.
         """
-        ir, stride, by_rows = self.ir, self.stride_of(name), sums == "rows"
+        w, stride, by_rows = self.w, self.stride_of(name), contracted == "rows"
         # The row of 8 numbers at which the lane points `ldmatrix`, in bytes.
         first = self.row_first if (side == "left") != by_rows else self.column_first
         place = (first[0] + row) * (2 * stride) + (first[1] + column) * 2
-        pointer = ir.shared(place, self.bytes_of(name))
+        pointer = w.shared(place, self.bytes_of(name))
 
         # A step of the sum, like a tile of the result, is 16 rows of 2 * stride bytes, or 16
         # columns of 2 bytes.
         def fragments(tile: int, step: int) -> list[Value]:
             down, right = (step, tile) if by_rows else (tile, step)
-            return ir.matrices(pointer, 32 * (down * stride + right), transposed=by_rows)
+            return w.matrices(pointer, 32 * (down * stride + right), transposed=by_rows)
 
         return fragments
 
@@ -164,7 +171,7 @@ class NetworkKernel(GpuKernel):
         full, rest = divmod(count, threads)
         numbers = [self.thread + threads * i for i in range(full)]
         if rest:
-            numbers.append(self.ir.minimum(self.thread + threads * full, count - 1))
+            numbers.append(self.w.minimum(self.thread + threads * full, count - 1))
         return numbers
 
     def pair_places(self, rows: int, columns: int) -> Iterator[tuple[Value, Value]]:
@@ -192,36 +199,36 @@ class NetworkKernel(GpuKernel):
         # The last layer; its columns beyond the outputs are zero.
         for row, column in self.pair_places(width, TILE):
             pair = [
-                self._within(params, row * outputs + shape.hidden, column + j, outputs)
+                self._within(params, row * outputs + shape.head_start, column + j, outputs)
                 for j in (0, 1)
             ]
             self._store_pair("head", row, column, pair)
-        head_biases = outputs * width + shape.hidden
+        head_biases = outputs * width + shape.head_start
         for i in self.each(MOST_OUTPUTS):
             self.write("head_biases", i, self._within(params, head_biases, i, outputs))
-        for name in ("mean", "scale"):
-            for i in self.each(self.first):
+        for name in ("mean", "inverse_std"):
+            for i in self.each(self.padded_inputs):
                 self.write(name, i, self._within(self.arrays[name], None, i, shape.observations))
 
     def _load_weights(self, offset: int, layer: int, places: list[tuple[Value, Value]]) -> None:
         """Copy pairs of a hidden layer's weights, with zeros beyond its inputs."""
-        ir, width, inputs = self.ir, self.shape.width, self.shape.inputs[layer]
+        w, width, inputs = self.w, self.shape.width, self.shape.inputs[layer]
         # Fetch all pairs before the first one is stored, so that the thread waits only once.
         fetched = []
         for row, column in places:
-            kept = ir.minimum(row, inputs - 1)
-            pair = [self.params[kept * width + column + (offset + j)] for j in (0, 1)]
+            clamped = w.minimum(row, inputs - 1)
+            pair = [self.params[clamped * width + column + (offset + j)] for j in (0, 1)]
             if inputs % TILE:
-                pair = [ir.select(row < inputs, x, 0.0) for x in pair]
+                pair = [w.select(row < inputs, x, 0.0) for x in pair]
             fetched.append((row, column, pair))
         for place in fetched:
             self._store_pair(f"weights{layer}", *place)
 
     def _within(self, array: Value, start: Value | None, index: Value, count: Value | int) -> Value:
         """Return an element of a row that starts somewhere; zero beyond the row's end."""
-        kept = self.ir.select(index < count, index, 0)
-        value = array[kept if start is None else start + kept]
-        return self.ir.select(index < count, value, 0.0)
+        clamped = self.w.select(index < count, index, 0)
+        value = array[clamped if start is None else start + clamped]
+        return self.w.select(index < count, value, 0.0)
 
     def load_observations(self, starts: Callable[[Value], Value]) -> None:
         """Fetch a tile's observations, and normalise them into layer 0.
@@ -229,41 +236,43 @@ class NetworkKernel(GpuKernel):
         Args:
           starts: a function from a row of the tile to the pointer to its observation.
         """
-        ir, count = self.ir, self.shape.observations
+        w, count = self.w, self.shape.observations
         # Fetch all pairs of the thread before the first one is stored.
         fetched = []
-        for row, column in self.pair_places(self.tiling.rows, self.first):
+        for row, column in self.pair_places(self.tiling.rows, self.padded_inputs):
             start = starts(row)
-            pair = [start[ir.minimum(column + j, count - 1)] for j in (0, 1)]
+            pair = [start[w.minimum(column + j, count - 1)] for j in (0, 1)]
             fetched.append((row, column, pair))
-        # (observation - mean) / std, with 1 / std as `scale`.
+        # (observation - mean) / std.
         for row, column, pair in fetched:
-            mean, scale = ([self.read(x, column, j) for j in (0, 1)] for x in ("mean", "scale"))
-            normalized = [(pair[j] - mean[j]) * scale[j] for j in (0, 1)]
+            mean, inverse_std = (
+                [self.read(name, column, j) for j in (0, 1)] for name in ("mean", "inverse_std")
+            )
+            normalized = [(pair[j] - mean[j]) * inverse_std[j] for j in (0, 1)]
             self._store_pair("layer0", row, column, normalized)
 
     def _store_pair(self, name: str, row: Value, column: Value, pair: list[Value]) -> None:
         """Store two neighbouring numbers of a matrix of float16."""
         place = row * (2 * self.stride_of(name)) + column * 2
-        self.ir.shared(place, self.bytes_of(name)).store(self.ir.pack(*pair))
+        self.w.shared(place, self.bytes_of(name)).store(self.w.pack(*pair))
 
     def synchronize_rows(self) -> None:
         """Wait for the warps that compute the same rows."""
-        self.ir.synchronize_group(self.row_group, LANES * self.tiling.column_groups)
+        self.w.synchronize_group(self.row_group, LANES * self.tiling.column_groups)
 
-    def forward(self) -> Sums:
-        """Write the forward pass of a tile, and return the outputs' sums.
+    def forward(self) -> Accumulators:
+        """Write the forward pass of a tile, and return the outputs.
 
         Each warp computes `row_tiles` x `pairs` tiles of 16 x 16 of every layer.
         """
-        ir, shape, tiling, steps = self.ir, self.shape, self.tiling, self.first // TILE
+        w, shape, tiling, steps = self.w, self.shape, self.tiling, self.padded_inputs // TILE
         for layer in range(shape.layers):
             # The activations before the layer times its weights, added to its biases.
             left = self.operand("left", self.layer(layer), "columns", self.row)
             right = self.operand("right", f"weights{layer}", "rows", 0, self.column)
             column = self.column + self.sum_column
             biases = self._biases(column, f"biases{layer}", 2 * self.pairs)
-            sums = ir.product(biases, steps, left, right)
+            sums = w.product(biases, steps, left, right)
             if layer and not tiling.is_gradient:
                 # The activations replace those of the layer before, which the other warps of these
                 # rows have read by then.
@@ -275,9 +284,9 @@ class NetworkKernel(GpuKernel):
         left = self.operand("left", self.layer(shape.layers), "columns", self.row)
         right = self.operand("right", "head", "rows")
         biases = self._biases(self.sum_column, "head_biases", 1)
-        return ir.product(biases, steps, left, right)
+        return w.product(biases, steps, left, right)
 
-    def store_outputs(self, sums: Sums) -> None:
+    def store_outputs(self, sums: Accumulators) -> None:
         """Store the outputs of the network in shared memory, a row for each sample."""
         first = (self.row + self.sum_row) * OUTPUT_STRIDE + self.sum_column
         for m, (four,) in enumerate(sums):
@@ -295,24 +304,24 @@ class NetworkKernel(GpuKernel):
         end = self.shape.policy_size - len(POLICY_METRICS)
         return [self.params[i] for i in range(end - self.shape.actions, end)]
 
-    def _biases(self, place: Value, name: str, columns: int) -> Sums:
+    def _biases(self, place: Value, name: str, columns: int) -> Accumulators:
         """Return the sums with which a layer's product begins: a bias for each column."""
         pairs = [[self.read(name, place, 8 * n + j) for j in (0, 1)] for n in range(columns)]
         # A lane's four sums are in two rows of the same two columns.
         return [[[*pair, *pair] for pair in pairs] for _ in range(self.tiling.row_tiles)]
 
-    def _activate(self, sums: Sums, layer: int) -> None:
-        """Store the activations of a layer and, if they do not tell it, the slopes."""
-        ir = self.ir
-        pointer = ir.shared(self.place, self.bytes_of(self.layer(layer)))
+    def _activate(self, sums: Accumulators, layer: int) -> None:
+        """Store the activations of a layer and, where `Tiling.stores_slopes`, the slopes."""
+        w = self.w
+        pointer = w.shared(self.own_bytes, self.bytes_of(self.layer(layer)))
         for offset, low, high in self.halves(sums):
-            pair = [_activated(ir, self.shape.activation, z) for z in (low, high)]
-            ir.moved(pointer, offset).store(ir.pack(pair[0][0], pair[1][0]))
-            if self.shape.activation == "swish" and self.tiling.is_gradient:
-                slopes = ir.shared(self.place, self.bytes_of(f"slopes{layer}"))
-                ir.moved(slopes, offset).store(ir.pack(pair[0][1], pair[1][1]))
+            pair = [activation(w, self.shape.activation, z) for z in (low, high)]
+            w.moved(pointer, offset).store(w.pack(*(value for value, _ in pair)))
+            if self.tiling.stores_slopes:
+                slopes = w.shared(self.own_bytes, self.bytes_of(f"slopes{layer}"))
+                w.moved(slopes, offset).store(w.pack(*(x for _, x in pair if x is not None)))
 
-    def halves(self, sums: Sums) -> list[tuple[int, Value, Value]]:
+    def halves(self, sums: Accumulators) -> list[tuple[int, Value, Value]]:
         """Return the bytes from the lane's place, and the two neighbouring sums that are there."""
         return [
             (2 * self.stride * (TILE * m + 8 * half) + 16 * n, four[2 * half], four[2 * half + 1])
@@ -322,14 +331,35 @@ class NetworkKernel(GpuKernel):
         ]
 
 
-def _activated(ir: GpuWriter, name: str, z: Value) -> tuple[Value, Value]:
-    """Return an activation, and for `swish` its slope."""
+# The activation functions. Except of `swish`, the slope follows from the activation.
+
+
+def activation(w: GpuWriter, name: str, z: Value) -> tuple[Value, Value | None]:
+    """Return an activation, and for `swish` the derivative, otherwise None."""
     if name == "tanh":
-        return ir.tanh(z), z
+        return w.tanh(z), None
     if name == "relu":
-        return ir.select(z < 0.0, ir.constant(0.0), z), z
+        return w.select(z < 0.0, w.constant(0.0), z), None
     if name == "elu":
-        return ir.select(z < 0.0, ir.exp(z) - 1.0, z), z
-    gate = ir.tanh(z * 0.5) * 0.5 + 0.5
+        return w.select(z < 0.0, w.exp(z) - 1.0, z), None
+    gate = w.tanh(z * 0.5) * 0.5 + 0.5
     value = z * gate
     return value, gate + value * (1.0 - gate)
+
+
+def times_slope(w: GpuWriter, name: str, stored: Value, factor: Value) -> Value:
+    """Return factor · activation'(z).
+
+    Args:
+      w: the writer of the kernel.
+      name: the name of the activation function.
+      stored: what the forward pass has stored: activation(z), or activation'(z) of `swish`.
+      factor: the factor.
+    """
+    if name == "tanh":
+        return factor * (1.0 - stored * stored)
+    if name == "relu":
+        return w.select(w.constant(0.0) < stored, factor, 0.0)
+    if name == "elu":
+        return w.select(stored < 0.0, factor * (stored + 1.0), factor)
+    return factor * stored

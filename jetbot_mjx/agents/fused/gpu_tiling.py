@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from typing import NamedTuple
 
-from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape, places
+from jetbot_mjx.agents.fused.shapes import DataSizes, UpdateShape, places
 from jetbot_mjx.agents.fused.tensor_core import LANES, TILE
 
 MOST_OUTPUTS = 8
@@ -14,7 +14,8 @@ OUTPUT_STRIDE = MOST_OUTPUTS + 1
 MOST_OBSERVATIONS = 64
 MOST_WIDTH = 128
 MOST_SUMS = 176
-"""Sums of the gradient that the registers of a thread hold beside those of a layer."""
+"""Sums of the gradient that a thread can hold. It has 255 registers, of which the sums of a layer's
+product take up to 64, and addresses and operands the others."""
 
 PAD = 8
 """Numbers between the rows of a matrix in shared memory, so that eight rows meet all banks."""
@@ -99,24 +100,37 @@ class Tiling:
         """Return whether all layers are kept, for a backward pass."""
         return self.purpose == "gradient"
 
-    def items(self, batch: Minibatch) -> int:
+    def items(self, batch: DataSizes) -> int:
         """Return how many samples, environments, or whole unrolls a tile holds."""
         # Each unroll is followed by its last observation.
         return self.rows // (batch.time + 1) if self.purpose == "advantages" else self.rows
 
-    def tiles(self, batch: Minibatch) -> int:
+    def tiles(self, batch: DataSizes) -> int:
         """Return the number of tiles of all data."""
         every = {"advantages": batch.unrolls, "actions": batch.environments}
         return -(-every.get(self.purpose, batch.samples) // self.items(batch))
 
     @property
     def extras(self) -> int:
-        """Return how many numbers of a sample beside the observation a row holds; it is odd."""
+        """Return how many numbers of a sample beside the observation a row holds.
+
+        They are odd, so that neighbouring threads, one for each row, access different banks.
+        """
         return 4 * self.shape.actions + 3
+
+    @property
+    def stores_slopes(self) -> bool:
+        """Return whether slopes are stored: they do not follow from the activations."""
+        return self.is_gradient and self.shape.activation == "swish"
 
     @functools.cached_property
     def layout(self) -> dict[str, int]:
         """Return the byte of shared memory where each array begins, and their `size`."""
+        return places(self.sizes, 16)
+
+    @functools.cached_property
+    def sizes(self) -> dict[str, int]:
+        """Return the bytes of each array in shared memory."""
         # Every kernel: the network, float16 but for biases and statistics, and the observations.
         shape, rows = self.shape, self.rows
         stride = shape.width + PAD
@@ -124,7 +138,7 @@ class Tiling:
         sizes = {f"weights{i}": 2 * padded(n) * stride for i, n in enumerate(shape.inputs[:-1])}
         sizes["head"] = 2 * shape.width * (TILE + PAD)
         sizes |= {f"biases{i}": 4 * shape.width for i in range(shape.layers)}
-        sizes |= {"head_biases": 4 * MOST_OUTPUTS, "mean": 4 * first, "scale": 4 * first}
+        sizes |= {"head_biases": 4 * MOST_OUTPUTS, "mean": 4 * first, "inverse_std": 4 * first}
         sizes["layer0"] = 2 * rows * (first + PAD)
         # All layers for a backward pass, or one, in which each replaces the one before.
         layers = range(1, 1 + (shape.layers if self.is_gradient else 1))
@@ -132,7 +146,7 @@ class Tiling:
         if self.is_gradient:
             # The loss's operands and results for each row, the statistics of the advantages, and a
             # sum for each row and slot.
-            if shape.activation == "swish":
+            if self.stores_slopes:
                 sizes |= {f"slopes{i}": 2 * rows * stride for i in layers}
             sizes["outputs"] = outputs
             sizes["errors"] = 2 * rows * (TILE + PAD)
@@ -144,20 +158,20 @@ class Tiling:
         else:
             # A number of each kind for each row and one behind it, and a pair of sums for each
             # thread and each lane.
-            sizes |= dict.fromkeys(("values", "deltas", "factors", "targets"), 4 * (rows + 1))
+            sizes |= dict.fromkeys(("values", "td_errors", "factors", "targets"), 4 * (rows + 1))
             sizes["statistics"] = 4 * 2 * (self.threads + LANES)
-        return places(sizes, 16)
+        return sizes
 
 
 def best_tiling(
-    purpose: str, shape: UpdateShape, batch: Minibatch, blocks: int, shared_memory: int
+    purpose: str, shape: UpdateShape, batch: DataSizes, blocks: int, shared_memory: int
 ) -> Tiling | None:
     """Return the tiling that fits and is likely fastest.
 
     Args:
       purpose: what the kernel computes, as in `Tiling`.
       shape: the networks.
-      batch: the data of a policy.
+      batch: the sizes of the data.
       blocks: the number of blocks that run at the same time.
       shared_memory: bytes of shared memory that a block may have.
 
@@ -169,12 +183,13 @@ def best_tiling(
     fitting = [x for x in tilings if x.layout["size"] <= shared_memory and x.items(batch)]
 
     def cost(tiling: Tiling) -> int:
-        # Larger tiles need fewer barriers for each sample,
+        # The gradient takes the largest tiles, which need the fewest barriers for each sample.
         if tiling.is_gradient:
             return -tiling.rows
-        # and smaller ones leave no multiprocessor without work. A tile takes some time for its
-        # barriers, whatever its size.
-        return -(-tiling.tiles(batch) // blocks) * (tiling.rows + 64)
+        # The others are short, and should leave no multiprocessor without work: the time of the
+        # block with the most tiles, each of which takes as long as 64 rows for its barriers.
+        most_tiles = -(-tiling.tiles(batch) // blocks)
+        return most_tiles * (tiling.rows + 64)
 
     return min(fitting, key=cost, default=None)
 

@@ -14,7 +14,7 @@ from jetbot_mjx.agents.fused.cpu_adam import adam_stages, update_stages
 from jetbot_mjx.agents.fused.cpu_gradient import gradient_stages
 from jetbot_mjx.agents.fused.cpu_network import HEAD
 from jetbot_mjx.agents.fused.cpu_stages import Call, Stage
-from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
+from jetbot_mjx.agents.fused.shapes import DataSizes, UnrollSpec, UpdateShape
 from onekernel.build import Backend, cpu, in_background
 
 BACKEND: Backend = cpu
@@ -25,7 +25,7 @@ _MOST_MEMORY = 4 << 20
 """Bytes of scratch memory of a part; what it works with should stay in the processor's cache."""
 
 
-def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
+def refusal(shape: UpdateShape, batch: DataSizes) -> str | None:
     """Return why the CPUs of this process cannot run the kernels, or None.
 
     Args:
@@ -36,7 +36,7 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return cpu.obstacle() or misfit(shape, batch, cpu.host_processor().lanes)
 
 
-def misfit(shape: UpdateShape, batch: Minibatch, lanes: int) -> str | None:
+def misfit(shape: UpdateShape, batch: DataSizes, lanes: int) -> str | None:
     """Return which size the kernels cannot take, or None.
 
     Args:
@@ -55,20 +55,20 @@ def misfit(shape: UpdateShape, batch: Minibatch, lanes: int) -> str | None:
 
 
 _STAGES: Mapping[str, Callable[..., Sequence[Sequence[Stage]]]] = {
-    "actions": lambda *given: [[ActionStage(*given)]],
-    "unroll": lambda *given: [[UnrollStage(*given)]],
+    "actions": lambda *arguments: [[ActionStage(*arguments)]],
+    "unroll": lambda *arguments: [[UnrollStage(*arguments)]],
     "gradient": gradient_stages,
     "adam": adam_stages,
     "update": update_stages,
 }
-"""Functions that return the stages of a kernel, by its name, from what it is written for, the data,
-and the number of float32 values in a vector register."""
+"""Functions that return the stages of a kernel, by its name, from what it is written for, the sizes
+of the data, and the number of float32 values in a vector register."""
 
 NAMES: Collection[str] = frozenset(_STAGES)
 """Names of the kernels, as in `launch.Launcher`."""
 
 
-def call_of(kernel: Signature, spec: Spec, batch: Minibatch, lanes: int) -> Call:
+def call_of(kernel: Signature, spec: Spec, batch: DataSizes, lanes: int) -> Call:
     """Return the call of a kernel.
 
     Args:
@@ -90,7 +90,7 @@ def call_of(kernel: Signature, spec: Spec, batch: Minibatch, lanes: int) -> Call
     )
 
 
-def _written(host: cpu.Host, kernel: Signature, spec: Spec, batch: Minibatch) -> str:
+def _written(host: cpu.Host, kernel: Signature, spec: Spec, batch: DataSizes) -> str:
     """Write the LLVM module of a kernel."""
     return call_of(kernel, spec, batch, host.lanes).text(host)
 
@@ -98,29 +98,30 @@ def _written(host: cpu.Host, kernel: Signature, spec: Spec, batch: Minibatch) ->
 _written_once = functools.cache(_written)
 
 
-def _text(host: cpu.Host, kernel: Signature, spec: Spec, batch: Minibatch) -> str:
+def _text(host: cpu.Host, kernel: Signature, spec: Spec, batch: DataSizes) -> str:
     """Return the LLVM module of a kernel, which is written once."""
-    if not isinstance(spec, Unroll):
+    if not isinstance(spec, UnrollSpec):
         return _written_once(host, kernel, spec, batch)
-    # That of an unroll is kept with the kernel of its environment, whom its name need not tell.
+    # The text of an unroll is stored with the kernel of its environment, under a name that tells
+    # what else the text depends on.
     name = repr((spec.shape, spec.observation, spec.kept, batch, host))
     return spec.kernel.text(name, lambda: _written(host, kernel, spec, batch))
 
 
-def prepare(kernel: Signature, spec: Spec, batch: Minibatch, policies: int) -> None:
-    """Begin to compile a kernel, which serves any number of policies, as `launch.prepare`."""
-    del policies
+def prepare(kernel: Signature, spec: Spec, batch: DataSizes, replicas: int) -> None:
+    """Begin to compile a kernel, which serves any number of replicas, as `launch.prepare`."""
+    del replicas
     host = cpu.host_processor()
     in_background(lambda: cpu.registered(_text(host, kernel, spec, batch)))
 
 
-def launch(kernel: Signature, spec: Spec, batch: Minibatch, arrays: Arrays) -> list[Array]:
+def launch(kernel: Signature, spec: Spec, batch: DataSizes, arrays: Arrays) -> list[Array]:
     """Call a kernel while JAX lowers a program for CPUs, as `launch.Launcher` specifies."""
-    host, policies = cpu.host_processor(), len(next(iter(arrays.values())))
+    host, replicas = cpu.host_processor(), len(next(iter(arrays.values())))
     # Results are as long as the call says, but for those that take the place of arguments.
     call = call_of(kernel, spec, batch, host.lanes)
     names = call.arrays[len(arrays) :]
-    shapes = [arrays[x].shape if x in arrays else (policies, call.sizes[x]) for x in names]
+    shapes = [arrays[x].shape if x in arrays else (replicas, call.sizes[x]) for x in names]
     like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]
     text = _text(host, kernel, spec, batch)
     return cpu.launch_text(text, list(arrays.values()), like, kernel.aliases)

@@ -1,8 +1,9 @@
 """Launch the kernels of PPO on NVIDIA GPUs.
 
-All policies of a batch share the launches: the policies are the third axis of the
-grid, and each gets its share of the GPU's multiprocessors. The blocks of a policy write a vector
-each, which XLA adds up in a fixed order.
+All replicas share the launches: they are the third axis of the grid, and each gets its share of the
+GPU's multiprocessors. A gradient has a row for each block of a network: in row b, block b of the
+policy network writes the policy's part, and block b of the value network the other one. XLA adds up
+the rows in a fixed order.
 """
 
 import functools
@@ -21,7 +22,7 @@ from jetbot_mjx.agents.fused.gpu_adam import BLOCK_ELEMENTS, AdamKernel
 from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel
 from jetbot_mjx.agents.fused.gpu_gradient import GradientKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
-from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.shapes import DataSizes, UpdateShape
 from jetbot_mjx.agents.fused.tensor_core import GpuKernel
 from onekernel.build import Backend, gpu, in_background
 
@@ -29,17 +30,17 @@ BACKEND: Backend = gpu
 """The back end that compiles the kernels."""
 
 _LEAST_CAPABILITY = 80
-"""Ten times the compute capability of the first GPUs with products of float16."""
+"""Ten times the compute capability of the first GPUs with the instruction `mma.m16n8k16`."""
 
 PTX_VERSION = 81
 """Ten times the first version of PTX whose conversions to float16 saturate."""
 
-_SHARED_MEMORY = {80: 163, 86: 99, 87: 163, 89: 99, 90: 227, 110: 227, 120: 99}
+_SHARED_KIB = {80: 163, 86: 99, 87: 163, 89: 99, 90: 227, 110: 227, 120: 99}
 """Shared memory that a block may have [KiB], by the least compute capability. It is that of a
 multiprocessor but for 1 KiB, by NVIDIA's programming guide."""
 
 
-def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
+def refusal(shape: UpdateShape, batch: DataSizes) -> str | None:
     """Return why the GPUs of this process cannot run the kernels, or None.
 
     Args:
@@ -72,31 +73,31 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return None
 
 
-def _run(kernel: GpuKernel, ptx: str, policies: int, arrays: Arrays) -> dict[str, Array]:
+def _run(kernel: GpuKernel, ptx: str, replicas: int, arrays: Arrays) -> dict[str, Array]:
     """Launch a kernel with some of the arrays, and return its results by name."""
-    given, names = list(kernel.arguments), kernel.returns
+    arguments, names = list(kernel.arguments), kernel.returns
     # What it changes in place has the shape that the argument has.
-    shapes = [arrays[x].shape if x in given else (policies, *kernel.shapes[x]) for x in names]
-    made = gpu.launch_ptx(
+    shapes = [arrays[x].shape if x in arguments else (replicas, *kernel.shapes[x]) for x in names]
+    results = gpu.launch_ptx(
         kernel.name,
         ptx,
-        [arrays[name] for name in given],
+        [arrays[name] for name in arguments],
         [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes],
-        (kernel.blocks, kernel.networks, policies),
+        (kernel.blocks, kernel.networks, replicas),
         kernel.threads,
         kernel.shared_memory,
-        {given.index(name): i for i, name in enumerate(names) if name in given},
+        {arguments.index(name): i for i, name in enumerate(names) if name in arguments},
     )
-    return dict(zip(names, made, strict=True))
+    return dict(zip(names, results, strict=True))
 
 
 @functools.cache
 def _kernels(
-    kernel: Signature, spec: Spec, batch: Minibatch, policies: int
+    kernel: Signature, spec: Spec, batch: DataSizes, replicas: int
 ) -> list[tuple[GpuKernel, Future[str]]]:
     """Divide the work among the blocks, and begin to compile the kernels, in their order."""
-    # The policies share the GPU's multiprocessors.
-    most = max(1, gpu.processor_count() // policies)
+    # The replicas share the GPU's multiprocessors.
+    most = max(1, gpu.processor_count() // replicas)
     if isinstance(spec, AdamRule):
         blocks = min(most, -(-spec.shape.size // BLOCK_ELEMENTS))
         return [_begin(AdamKernel(spec, blocks))]
@@ -112,7 +113,7 @@ def _kernels(
     return [_begin(first), _begin(second)]
 
 
-def _division(purpose: str, shape: UpdateShape, batch: Minibatch, most: int) -> tuple[Tiling, int]:
+def _division(purpose: str, shape: UpdateShape, batch: DataSizes, most: int) -> tuple[Tiling, int]:
     """Return the tiling for a purpose, and the number of blocks: no more than the most."""
     tiling = gpu_tiling.best_tiling(purpose, shape, batch, most, _shared_memory())
     assert tiling is not None
@@ -135,22 +136,23 @@ NAMES: Collection[str] = frozenset(kernel.name for kernel in (ACTIONS, GRADIENT,
 """Names of the kernels, as in `launch.Launcher`."""
 
 
-def prepare(kernel: Signature, spec: Spec, batch: Minibatch, policies: int) -> None:
+def prepare(kernel: Signature, spec: Spec, batch: DataSizes, replicas: int) -> None:
     """Begin to compile a kernel, as `launch.prepare`."""
-    _kernels(kernel, spec, batch, policies)
+    _kernels(kernel, spec, batch, replicas)
 
 
-def launch(kernel: Signature, spec: Spec, batch: Minibatch, arrays: Arrays) -> list[Array]:
+def launch(kernel: Signature, spec: Spec, batch: DataSizes, arrays: Arrays) -> list[Array]:
     """Launch a kernel while JAX lowers a program for GPUs, as `launch.Launcher` specifies."""
-    found, policies = dict(arrays), len(next(iter(arrays.values())))
-    for written, ptx in _kernels(kernel, spec, batch, policies):
-        found |= _run(written, ptx.result(), policies, found)
-    # The blocks of a gradient write a vector each; they are added up in a fixed order.
+    found, replicas = dict(arrays), len(next(iter(arrays.values())))
+    for written, ptx in _kernels(kernel, spec, batch, replicas):
+        found |= _run(written, ptx.result(), replicas, found)
+    # Add up the rows of the blocks.
     if kernel is GRADIENT:
         found["gradient"] = found["gradients"].sum(1)
     return [found[name] for name in kernel.returns]
 
 
 def _shared_memory() -> int:
+    """Return the shared memory that a block may have on this GPU [bytes]."""
     capability = gpu.compute_capability()
-    return _SHARED_MEMORY[max(x for x in _SHARED_MEMORY if x <= capability)] << 10
+    return _SHARED_KIB[max(x for x in _SHARED_KIB if x <= capability)] << 10

@@ -18,8 +18,7 @@ from jetbot_mjx.agents.brax_parts import Normalizer, Transition
 from jetbot_mjx.agents.fused import adam, arrays, launch, probe
 from jetbot_mjx.agents.fused.adam import AdamRule, AdamTerms, Progress
 from jetbot_mjx.agents.fused.layout import VectorLayout
-from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch, UpdateShape
-from jetbot_mjx.agents.fused.shapes import Unroll as UnrollSpec
+from jetbot_mjx.agents.fused.shapes import DataSizes, LossTerms, UnrollSpec, UpdateShape
 from jetbot_mjx.agents.learner import ONE_DEVICE, DeviceAxis, Learner, PackedEnv, UnrollFn
 from jetbot_mjx.agents.optimizer import read_adam, write_adam
 from jetbot_mjx.agents.random_keys import Keys
@@ -104,14 +103,14 @@ class FusedLearner(Learner):
         self._config, self._devices = config, devices
         # Each device has its share of the environments and of every minibatch.
         unrolls, steps = config.batch_size // devices.size, config.num_minibatches
-        self.batch = Minibatch(
+        self.batch = DataSizes(
             collected=unrolls * steps,
             unrolls=unrolls,
             time=config.unroll_length,
             minibatches=steps * config.num_updates_per_batch,
             environments=config.num_envs // devices.size,
         )
-        """A minibatch on one device."""
+        """The sizes of the data on one device."""
         schedule = config.learning_rate_schedule
         self.rule = AdamRule(shape, self.batch.samples, schedule, self.batch.minibatches)
         """What the vectors hold, and how the step size changes."""
@@ -132,16 +131,16 @@ class FusedLearner(Learner):
             return None
         return "its kernels failed their check on this machine"
 
-    def prepare(self, policies: int) -> None:
-        """Begin to compile the kernels for a number of policies that train at once."""
+    def prepare(self, replicas: int) -> None:
+        """Begin to compile the kernels for a number of trainings that run at once."""
         # An unroll is prepared as soon as its environment is known.
         if not launch.has(arrays.UNROLL):
-            launch.prepare(arrays.ACTIONS, self.shape, self.batch, policies)
+            launch.prepare(arrays.ACTIONS, self.shape, self.batch, replicas)
         if self.at_once:
-            launch.prepare(arrays.UPDATE, self.rule, self.batch, policies)
+            launch.prepare(arrays.UPDATE, self.rule, self.batch, replicas)
         else:
-            launch.prepare(arrays.GRADIENT, self.shape, self.batch, policies)
-            launch.prepare(arrays.ADAM, self.rule, self.batch, policies)
+            launch.prepare(arrays.GRADIENT, self.shape, self.batch, replicas)
+            launch.prepare(arrays.ADAM, self.rule, self.batch, replicas)
 
     # The collection.
 
@@ -159,12 +158,12 @@ class FusedLearner(Learner):
         )
 
         def unroll(start: Packed, key: PRNGKeyArray) -> tuple[Packed, Transition]:
-            given = *statistics, start.words, self.action_noise(key)
-            end, words, drawn = launch.unroll(spec, state.params, *given)
+            arguments = *statistics, start.words, self.action_noise(key)
+            end, words, actions = launch.unroll(spec, state.params, *arguments)
             kept = kept_like.replace(words=words).unpack()
             # The observation before a step is that after the step before.
             obs = jnp.concatenate([start.unpack().obs[None], kept["obs"][:-1]])
-            data = transition(obs, drawn.action, self._extras(drawn), kept)
+            data = transition(obs, actions.action, self._extras(actions), kept)
             return start.replace(words=end), data
 
         return unroll
@@ -204,8 +203,8 @@ class FusedLearner(Learner):
         statistics = self._statistics(normalizer)
 
         def act(observations: Array, noise: Array) -> tuple[Array, Extras]:
-            drawn = launch.actions(self.shape, params, *statistics, observations, noise)
-            return drawn.action, self._extras(drawn)
+            actions = launch.actions(self.shape, params, *statistics, observations, noise)
+            return actions.action, self._extras(actions)
 
         return act
 
@@ -215,12 +214,12 @@ class FusedLearner(Learner):
             key, (self.batch.time, self.batch.environments, self.shape.actions)
         )
 
-    def _extras(self, drawn: launch.Actions) -> Extras:
+    def _extras(self, actions: launch.Actions) -> Extras:
         """Return what Brax keeps of actions."""
-        extras = drawn._asdict()
+        extras = actions._asdict()
         del extras["action"]
         if self.shape.distribution == "normal":
-            extras["distribution_params"] = tuple(jnp.split(drawn.distribution_params, 2, -1))
+            extras["distribution_params"] = tuple(jnp.split(actions.distribution_params, 2, -1))
         return extras
 
     def _statistics(self, normalizer: Normalizer) -> tuple[Array, Array]:
@@ -248,25 +247,25 @@ class FusedLearner(Learner):
         shuffle_key, noise_key = jax.random.split(key)
         shuffle_keys = jax.random.split(shuffle_key, self._config.num_updates_per_batch)
         orders = jax.vmap(lambda key: jax.random.permutation(key, self.batch.collected))
-        unrolls = orders(shuffle_keys).reshape(self.batch.minibatches, -1)
+        unroll_indices = orders(shuffle_keys).reshape(self.batch.minibatches, -1)
         noise = self.noise(jax.random.split(noise_key, self.batch.minibatches))
         state = self.first_vectors(params, optimizer_state)
         # All minibatches by one kernel.
         if self.at_once:
-            given = *collected, unrolls, noise, self._loss_terms(), terms, *state
-            return self.results(launch.update(self.rule, *given), optimizer_state)
+            arguments = *collected, unroll_indices, noise, self._loss_terms(), terms, *state
+            return self.results(launch.update(self.rule, *arguments), optimizer_state)
 
         # Or one by one: advantages and gradient, and a step of Adam.
         def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
             index, params, mu, nu, progress = state
-            gradient = self.gradient(params, collected, unrolls, noise, index)
-            made = launch.adam(self.rule, gradient, params, mu, nu, progress, index, terms)
-            return index + 1, *made
+            gradient = self.gradient(params, collected, unroll_indices, noise, index)
+            vectors = launch.adam(self.rule, gradient, params, mu, nu, progress, index, terms)
+            return index + 1, *vectors
 
         # `scan` would carry a counter of its own beside `index`, which would be another launch.
-        begun = jnp.zeros((), jnp.int32), *state
-        ended = jax.lax.while_loop(lambda state: state[0] < self.batch.minibatches, step, begun)
-        return self.results(ended[1:], optimizer_state)
+        first = jnp.zeros((), jnp.int32), *state
+        last = jax.lax.while_loop(lambda state: state[0] < self.batch.minibatches, step, first)
+        return self.results(last[1:], optimizer_state)
 
     def collected(self, data: Transition, normalizer: Normalizer) -> tuple[Array, ...]:
         """Return the collected data as the kernels read it.
@@ -276,11 +275,12 @@ class FusedLearner(Learner):
           normalizer: the statistics of the observations.
 
         Returns:
-          The arrays `mean`, `scale`, `rows` and `last` of `arrays.AXES`.
+          The arrays `mean`, `inverse_std`, `rows` and `last` of `arrays.AXES`.
         """
         # A row for each step: what the policy saw and did, and what came of it.
-        kept: PyTree = data.extras["policy_extras"]
-        parts = data.observation, kept["raw_action"], kept["log_prob"], kept["distribution_params"]
+        extras: PyTree = data.extras["policy_extras"]
+        names = "raw_action", "log_prob", "distribution_params"
+        parts = data.observation, *(extras[name] for name in names)
         results = data.reward, data.discount, data.extras["state_extras"]["truncation"]
         # Each is a number of a step or several; a `normal` distribution has two arrays.
         leaves = (x.reshape(*data.reward.shape, -1) for x in jax.tree.leaves((parts, results)))
@@ -297,7 +297,7 @@ class FusedLearner(Learner):
         self,
         params: Float[Array, " size"],
         collected: tuple[Array, ...],
-        unrolls: Int[Array, "minibatches unrolls"],
+        unroll_indices: Int[Array, "minibatches unrolls"],
         noise: Float[Array, "minibatches time unrolls actions"],
         index: Int[Array, ""],
     ) -> Float[Array, " size"]:
@@ -306,16 +306,17 @@ class FusedLearner(Learner):
         Args:
           params: the parameters.
           collected: all data, from `collected`.
-          unrolls: the unrolls of all minibatches.
+          unroll_indices: which of the collected unrolls are in each minibatch.
           noise: their noise, from `noise`.
           index: the minibatch.
 
         Returns:
           The gradient as a vector, with the sums of the metrics at their places.
         """
-        # Two kernels: advantages and value targets, then both networks forward and backward.
-        drawn = unrolls, noise, index
-        gradient = launch.gradient(self.shape, params, *collected, *drawn, self._loss_terms())
+        # On GPUs by two kernels: first advantages and value targets, then both networks forward and
+        # backward. On CPUs by one call.
+        arguments = *collected, unroll_indices, noise, index, self._loss_terms()
+        gradient = launch.gradient(self.shape, params, *arguments)
         return gradient if self._devices.size == 1 else self._devices.mean(gradient)
 
     def _loss_terms(self) -> Float[Array, " terms"]:
@@ -329,13 +330,13 @@ class FusedLearner(Learner):
         Args:
           optimizer_state: the state before it.
         """
-        config, share = self._config, 1.0 / self._config.gradient_steps
+        config, fraction = self._config, 1.0 / self._config.gradient_steps
         return _array(
             AdamTerms(
                 max_grad_norm=jnp.inf if config.max_grad_norm is None else config.max_grad_norm,
                 learning_rate=config.learning_rate,
-                begun=read_adam(optimizer_state).count * share,
-                share=share,
+                fraction_done=read_adam(optimizer_state).count * fraction,
+                fraction_per_step=fraction,
                 desired_kl=config.desired_kl,
                 min_rate=config.learning_rate_schedule_min_lr,
                 max_rate=config.learning_rate_schedule_max_lr,
@@ -345,7 +346,7 @@ class FusedLearner(Learner):
     def first_vectors(
         self, params: Array, optimizer_state: PyTree
     ) -> tuple[Array, Array, Array, Array]:
-        """Return the parameters, Adam's means, and the progress before the first minibatch."""
+        """Return the parameters, Adam's moments, and the progress before the first minibatch."""
         # The powers of Adam's β are carried from step to step.
         state = read_adam(optimizer_state)
         progress = Progress(
@@ -368,7 +369,7 @@ class FusedLearner(Learner):
         """Return the results of `update`.
 
         Args:
-          vectors: the parameters, Adam's means, and the progress after the last minibatch.
+          vectors: the parameters, Adam's moments, and the progress after the last minibatch.
           optimizer_state: the state before the first one.
         """
         # The last row of the progress has the sums over all minibatches.
@@ -389,7 +390,7 @@ class FusedLearner(Learner):
         mean = dict(zip(adam.METRICS, sums / self.rule.samples, strict=True))
         losses = {
             "policy_loss": mean["policy_loss"],
-            "v_loss": mean["value_loss"] * (0.5 * config.vf_loss_coefficient),
+            "v_loss": mean["squared_error"] * (0.5 * config.vf_loss_coefficient),
             "entropy_loss": mean["entropy"] * -config.entropy_cost,
         }
         return {

@@ -48,7 +48,7 @@ def runs_correctly() -> bool:
     pairs = zip(jax.tree.leaves(others), jax.tree.leaves(wanted), strict=True)
     errors = [np.abs(one - other).max() for one, other in pairs]
     # Beside the gradient, the vector has the sums of the metrics, which are no derivatives.
-    ours[_RULE.places] = theirs[_RULE.places] = 0.0
+    ours[_RULE.metric_places] = theirs[_RULE.metric_places] = 0.0
     errors.append(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs))
     # A comparison with NaN is false, so that NaN fails the check.
     return all(bool(error <= _MOST_ERROR) for error in errors)
@@ -73,17 +73,17 @@ def _run(
     columns, size, index = _SHAPE.columns, _SHAPE.observations, jnp.zeros((), jnp.int32)
     network = _SHAPE, params, jnp.zeros(size), jnp.ones(size)
     # The policy that collects is the one that learns, so nothing is clipped.
-    drawn = launch.actions(*network, rows[..., :size].reshape(-1, size), noise[1].reshape(-1, 1))
-    _, *collected = (x.reshape(_UNROLLS, _TIME, -1) for x in drawn)
+    actions = launch.actions(*network, rows[..., :size].reshape(-1, size), noise[1].reshape(-1, 1))
+    _, *collected = (x.reshape(_UNROLLS, _TIME, -1) for x in actions)
     start, stop = columns["raw_action"], columns["reward"]
     rows = rows.at[..., start:stop].set(jnp.concatenate(collected, -1))
     order = jnp.arange(_UNROLLS, dtype=jnp.int32)
-    given = rows, last, order[None], noise[:1], index
-    gradient = launch.gradient(*network, *given, jnp.asarray(_TERMS))
-    # Any vectors serve as gradient and means of Adam.
+    data = rows, last, order[None], noise[:1], index
+    gradient = launch.gradient(*network, *data, jnp.asarray(_TERMS))
+    # Any vectors serve as gradient and moments of Adam.
     progress = np.zeros((2, SIZES["progress"]), np.float32)
     progress[0, :3] = _RATE, 1, 1
     adam_terms = np.zeros(SIZES["adam_terms"], np.float32)
     adam_terms[0] = _MOST_NORM
-    given = params, params, params, abs(params), progress, index, adam_terms
-    return gradient, drawn, launch.adam(_RULE, *map(jnp.asarray, given))
+    arguments = params, params, params, abs(params), progress, index, adam_terms
+    return gradient, actions, launch.adam(_RULE, *map(jnp.asarray, arguments))

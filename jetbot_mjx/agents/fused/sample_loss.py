@@ -2,14 +2,15 @@
 
 A sample is one step of one environment. Its outputs of the policy network, and the standard
 deviations if they are parameters, are the normal distribution N(μ, σ) of the action before its
-tanh. With the ratio ρ of the action's probability to that in the collection, the advantage A, the
-entropy H and the value target V', the losses of a sample are
+tanh. The loss of a minibatch, which `jetbot_mjx.agents.ppo` states, is the mean of these terms of
+its samples:
 
-    L_policy = -min(ρ A, clip(ρ, 1 - ε, 1 + ε) A) - c_entropy H
-    L_value = ½ c_value (V' - V)²
+    L_policy  = -min(ρ Â, clip(ρ, 1 - ε, 1 + ε) Â)
+    L_value   = ½ c_v (V' - V)²
+    L_entropy = -c_e H
 
-JAX differentiates them, and `onekernel` lowers both for CPUs and for GPUs. The functions know
-nothing of batches, networks and memory.
+JAX differentiates them, and `onekernel` lowers the loss with its derivatives, for CPUs and for
+GPUs. The functions know nothing of batches, networks and memory.
 
 Source: J. Schulman et al., Proximal Policy Optimization Algorithms, arXiv:1707.06347; formulas as
 in `brax.training.agents.ppo.losses` and `brax.training.distribution`.
@@ -32,7 +33,9 @@ _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
 
 def activation(name: str, z: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return an activation and its derivative.
+    """Return an activation and its derivative, for CPUs.
+
+    A GPU has instructions of its own for them: see `gpu_network`.
 
     Args:
       name: its name in `ppo.network.activation`.
@@ -48,14 +51,14 @@ class ActionDistribution(NamedTuple):
     """An `ActionDistribution` is the normal distribution of an action, before its tanh if any."""
 
     mean: Float[Array, " actions"]
-    scale: Float[Array, " actions"]
+    std: Float[Array, " actions"]
     """Standard deviations."""
     tanh: bool
     """Whether the action is the tanh of the normal number, as for `tanh_normal`."""
 
     @classmethod
     def of(cls, outputs: Array, deviations: Array, tanh: bool) -> "ActionDistribution":
-        """Return the distribution by the outputs of the policy network.
+        """Return the distribution that outputs of the policy network stand for.
 
         Args:
           outputs: the outputs: means and, for `tanh_normal`, what the deviations follow from.
@@ -63,30 +66,30 @@ class ActionDistribution(NamedTuple):
           tanh: whether the distribution is `tanh_normal`.
         """
         actions = len(deviations)
-        scale = _softplus(outputs[actions:]) + _MIN_STD if tanh else deviations
-        return cls(outputs[:actions], scale, tanh)
+        std = _softplus(outputs[actions:]) + _MIN_STD if tanh else deviations
+        return cls(outputs[:actions], std, tanh)
 
     def draw(self, noise: Array) -> Array:
         """Return the number before the tanh, by standard normal noise."""
-        return noise * self.scale + self.mean
+        return noise * self.std + self.mean
 
     def log_prob(self, raw: Array) -> Float[Array, ""]:
         """Return the logarithm of the probability of an action, given before its tanh."""
-        distance = (raw - self.mean) * (1.0 / self.scale)
-        logs = -0.5 * jnp.square(distance) - jnp.log(self.scale) - _HALF_LOG_TWO_PI
+        distance = (raw - self.mean) * (1.0 / self.std)
+        logs = -0.5 * jnp.square(distance) - jnp.log(self.std) - _HALF_LOG_TWO_PI
         # A tanh makes the density larger by 1 / slope.
         return (logs - _log_tanh_slope(raw)).sum() if self.tanh else logs.sum()
 
     def entropy(self, noise: Array) -> Float[Array, ""]:
         """Return the entropy; that of the tanh is estimated from one number drawn by noise."""
-        entropy = jnp.log(self.scale) + (0.5 + _HALF_LOG_TWO_PI)
+        entropy = jnp.log(self.std) + (0.5 + _HALF_LOG_TWO_PI)
         return (entropy + _log_tanh_slope(self.draw(noise))).sum() if self.tanh else entropy.sum()
 
     def divergence(self, old: "ActionDistribution") -> Float[Array, ""]:
         """Return the KL divergence from another distribution, which a tanh does not change."""
-        inverse, difference = 1.0 / self.scale, old.mean - self.mean
-        square = old.scale * old.scale + difference * difference
-        log = jnp.log(self.scale / old.scale + 1e-5)
+        inverse, difference = 1.0 / self.std, old.mean - self.mean
+        square = old.std * old.std + difference * difference
+        log = jnp.log(self.std / old.std + 1e-5)
         return (log + 0.5 * square * inverse * inverse - 0.5).sum()
 
 
@@ -112,7 +115,7 @@ def _log_tanh_slope(x: Array) -> Array:
 # Drawing an action.
 
 
-def action_sample(
+def draw_action(
     outputs: Array, deviations: Array, noise: Array, *, tanh: bool
 ) -> tuple[Array, Array, Array, Array]:
     """Draw an action.
@@ -129,14 +132,15 @@ def action_sample(
     """
     policy = ActionDistribution.of(outputs, deviations, tanh)
     raw = policy.draw(noise)
-    # From the rounded action, as the update computes it.
+    # Not from the noise, which would be shorter: the loss knows the rounded action only, and its
+    # logarithm is to be the same as long as the policy is.
     log_prob = policy.log_prob(raw)
     if tanh:
         return jnp.tanh(raw), raw, log_prob, outputs
-    return raw, raw, log_prob, jnp.concatenate([policy.mean, policy.scale])
+    return raw, raw, log_prob, jnp.concatenate([policy.mean, policy.std])
 
 
-# The loss of the policy.
+# The loss of the policy network.
 
 
 class PolicySample(NamedTuple):
@@ -150,7 +154,7 @@ class PolicySample(NamedTuple):
     """The action before its tanh."""
     log_prob: Float[Array, ""]
     """Logarithm of its probability in the collection."""
-    old: Float[Array, " 2*actions"]
+    old_parameters: Float[Array, " 2*actions"]
     """Parameters of the distribution in the collection."""
     noise: Float[Array, " actions"]
     """Standard normal noise, which estimates the entropy."""
@@ -160,41 +164,42 @@ class PolicySample(NamedTuple):
     """1, or 0 if there is no such sample."""
 
 
-def policy_loss(
+def policy_and_entropy_loss(
     outputs: Array, deviations: Array, sample: PolicySample, terms: LossTerms, *, tanh: bool
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], ...]]:
-    """Compute the policy's loss of one sample.
+    """Compute L_policy + L_entropy of one sample.
 
     Args:
-      outputs: those of the sample, by which the loss is differentiated.
+      outputs: those of the sample, with respect to which the loss is differentiated.
       deviations: likewise.
       sample: the sample.
       terms: the coefficients of the loss.
       tanh: whether the distribution is `tanh_normal`.
 
     Returns:
-      The loss, and the metrics of `POLICY_METRICS`.
+      L_policy + L_entropy, and the metrics of `POLICY_METRICS`.
     """
     policy = ActionDistribution.of(outputs, deviations, tanh)
-    old = ActionDistribution.of(sample.old, sample.old[len(deviations) :], tanh)
-    # The clipped surrogate objective. Where the clipped one is smaller, the ratio is outside of the
-    # range, and the objective does not depend on the policy.
+    parameters = sample.old_parameters
+    old = ActionDistribution.of(parameters, parameters[len(deviations) :], tanh)
+    # The clipped surrogate objective, -L_policy. Where the clipped one is smaller, the ratio ρ is
+    # outside of the range, and the objective does not depend on the policy.
     ratio = jnp.exp(policy.log_prob(sample.action) - sample.log_prob)
     low, high = 1.0 - terms.clipping_epsilon, 1.0 + terms.clipping_epsilon
     surrogate = ratio * sample.advantage
     clipped = jax.lax.stop_gradient(jnp.clip(ratio, low, high) * sample.advantage)
     objective = jnp.where(surrogate <= clipped, surrogate, clipped)
-    # The entropy bonus.
+    # The entropy bonus, -L_entropy.
     entropy = policy.entropy(sample.noise)
     loss = -objective - terms.entropy_cost * entropy
-    # What else the metrics tell: how far the policy is from that of the collection.
-    return loss, (-objective, entropy, policy.divergence(old), policy.scale.sum())
+    # The metrics: beside both, how far the policy is from that of the collection, and how wide.
+    return loss, (-objective, entropy, policy.divergence(old), policy.std.sum())
 
 
-def policy_sample(
+def policy_gradient(
     sample: PolicySample, terms: LossTerms, *, samples: int, tanh: bool
 ) -> tuple[Array, ...]:
-    """Return the derivatives of the policy's loss by one sample, and the sample's metrics.
+    """Return a sample's part of the gradient of L_policy + L_entropy, and the sample's metrics.
 
     Args:
       sample: the sample.
@@ -203,21 +208,21 @@ def policy_sample(
       tanh: whether the distribution is `tanh_normal`.
 
     Returns:
-      The derivatives by the outputs, by the deviations (none for `tanh_normal`), and the metrics of
-      `POLICY_METRICS`.
+      The derivatives with respect to the outputs and to the deviations (none for `tanh_normal`),
+      and the metrics of `POLICY_METRICS`.
     """
 
-    def share(outputs: Array, deviations: Array) -> tuple[Array, tuple[Array, ...]]:
-        loss, metrics = policy_loss(outputs, deviations, sample, terms, tanh=tanh)
+    def scaled_loss(outputs: Array, deviations: Array) -> tuple[Array, tuple[Array, ...]]:
+        loss, metrics = policy_and_entropy_loss(outputs, deviations, sample, terms, tanh=tanh)
         return loss * (sample.weight / samples), metrics
 
-    gradient = jax.grad(share, argnums=(0, 1), has_aux=True)
-    (by_outputs, by_deviations), metrics = gradient(sample.outputs, sample.deviations)
+    gradient = jax.grad(scaled_loss, argnums=(0, 1), has_aux=True)
+    (d_outputs, d_deviations), metrics = gradient(sample.outputs, sample.deviations)
     metrics = tuple(x * sample.weight for x in metrics)
-    return (by_outputs, *metrics) if tanh else (by_outputs, by_deviations, *metrics)
+    return (d_outputs, *metrics) if tanh else (d_outputs, d_deviations, *metrics)
 
 
-# The loss of the values.
+# The loss of the value network.
 
 
 class ValueStep(NamedTuple):
@@ -232,10 +237,10 @@ class ValueStep(NamedTuple):
 
 
 def value_error(step: ValueStep, terms: LossTerms) -> tuple[Array, Array]:
-    """Return δₜ of the equation that `jetbot_mjx.agents.gae` states, and the factor of Aₜ₊₁.
+    """Return δₜ of the equations that `jetbot_mjx.agents.gae` states, and the factor of Aₜ₊₁.
 
     Args:
-      step: the step; with the next target as its `next_value`, δₜ is the advantage.
+      step: the step; with the next target V'ₜ₊₁ as its `next_value`, δₜ becomes the advantage Âₜ.
       terms: the coefficients of the loss.
     """
     not_truncated = 1.0 - step.truncation
@@ -246,23 +251,23 @@ def value_error(step: ValueStep, terms: LossTerms) -> tuple[Array, Array]:
     return delta, discount * not_truncated * terms.gae_lambda
 
 
-def value_sample(
+def value_gradient(
     value: Array, target: Array, coefficient: Array, samples: int
 ) -> tuple[Array, ...]:
-    """Return the derivative of the value loss by one value, and the squared error.
+    """Return the derivative of L_value with respect to one value, and the squared error.
 
     Args:
-      value: the value.
-      target: its target, on which no gradient depends.
-      coefficient: the coefficient of the value loss.
+      value: V.
+      target: V', on which no gradient depends.
+      coefficient: c_v.
       samples: the number of samples of the minibatch, of whose losses the mean is taken.
     """
 
-    def share(value: Array) -> tuple[Array, Array]:
+    def scaled_loss(value: Array) -> tuple[Array, Array]:
         square = jnp.square(target - value)
         return 0.5 * square * coefficient * (1.0 / samples), square
 
-    return jax.grad(share, has_aux=True)(value)
+    return jax.grad(scaled_loss, has_aux=True)(value)
 
 
 def value_step(
@@ -272,25 +277,25 @@ def value_step(
 
     Args:
       step: the step.
-      next_target: the value target of the next step.
+      next_target: the value target V'ₜ₊₁ of the next step.
       next_gae: the generalised advantage estimate Aₜ₊₁ of the next step.
       terms: the coefficients of the loss.
       samples: the number of samples of the minibatch.
 
     Returns:
-      The advantage, the derivative of the loss by the value, the squared error, and for the step
-      before this one the value, the target and the estimate.
+      The advantage Âₜ, the derivative of L_value with respect to the value, the squared error, and
+      for the step before this one Vₜ, V'ₜ and Aₜ.
     """
     delta, factor = value_error(step, terms)
     gae = gae_step(delta, factor, next_gae)
     target = gae + step.value
     advantage, _ = value_error(step._replace(next_value=next_target), terms)
-    slope, square = value_sample(step.value, target, terms.vf_loss_coefficient, samples)
-    return advantage, slope, square, step.value, target, gae
+    error, square = value_gradient(step.value, target, terms.vf_loss_coefficient, samples)
+    return advantage, error, square, step.value, target, gae
 
 
-# The programs of the kernels, functions of the scalars of their arguments in order. Those
-# of GPUs have approximate instructions.
+# The programs of the kernels, functions of the scalars of their arguments in order. Those of GPUs
+# have approximate instructions for exp, log and 1/x.
 
 
 def vector_of(*sizes: int) -> Any:
@@ -304,20 +309,20 @@ _STEP = ValueStep(*[vector_of()] * len(ValueStep._fields))
 
 @functools.cache
 def action_program(shape: UpdateShape, *, for_gpu: bool = False) -> ScalarProgram:
-    """Lower `action_sample`."""
-    draw = functools.partial(action_sample, tanh=shape.distribution == "tanh_normal")
+    """Lower `draw_action`."""
+    draw = functools.partial(draw_action, tanh=shape.distribution == "tanh_normal")
     sizes = shape.outputs[0], shape.actions, shape.actions
     return scalarize(draw, *map(vector_of, sizes), approximate=for_gpu)
 
 
 @functools.cache
 def policy_program(shape: UpdateShape, samples: int, *, for_gpu: bool = False) -> ScalarProgram:
-    """Lower `policy_sample`."""
+    """Lower `policy_gradient`."""
     each, number = vector_of(shape.actions), vector_of()
     outputs, old = vector_of(shape.outputs[0]), vector_of(2 * shape.actions)
     sample = PolicySample(outputs, each, each, number, old, each, number, number)
     tanh = shape.distribution == "tanh_normal"
-    loss = functools.partial(policy_sample, samples=samples, tanh=tanh)
+    loss = functools.partial(policy_gradient, samples=samples, tanh=tanh)
     return scalarize(loss, sample, _TERMS, approximate=for_gpu)
 
 
@@ -338,6 +343,6 @@ def gae_program() -> ScalarProgram:
 
 
 def value_program(samples: int) -> ScalarProgram:
-    """Lower `value_sample` for GPUs."""
-    loss = functools.partial(value_sample, samples=samples)
+    """Lower `value_gradient` for GPUs."""
+    loss = functools.partial(value_gradient, samples=samples)
     return scalarize(loss, *[vector_of()] * 3, approximate=True)

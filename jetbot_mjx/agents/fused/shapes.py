@@ -9,8 +9,11 @@ from onekernel import Kernel
 Number = TypeVar("Number")
 
 POLICY_METRICS = ("policy_loss", "entropy", "kl", "std")
-VALUE_METRICS = ("value_loss",)
-"""Sums over the samples, in the order of the vector of parameters."""
+"""Sums over the samples, behind the policy's parameters: of L_policy, of the entropy H, of the KL
+divergence from the policy of the collection, and of the actions' standard deviations."""
+
+VALUE_METRICS = ("squared_error",)
+"""Sums over the samples, behind the parameters of the value network: of (V' - V)²."""
 
 
 class UpdateShape(NamedTuple):
@@ -42,13 +45,13 @@ class UpdateShape(NamedTuple):
         return (self.observations, *[self.width] * self.layers)
 
     @property
-    def hidden(self) -> int:
-        """Return the number of parameters of the hidden layers of one network."""
+    def head_start(self) -> int:
+        """Return where the head begins, a network's last layer: behind the hidden layers."""
         return sum(self.width * (inputs + 1) for inputs in self.inputs[:-1])
 
     @property
     def hidden_layers(self) -> list[tuple[int, int, int]]:
-        """Return number, inputs and first parameter of each hidden layer of a network."""
+        """Return of each hidden layer its number, its inputs, and where its parameters begin."""
         # Weights, of shape (inputs, width), and biases of a layer precede those of the next one.
         sizes = (self.width * (inputs + 1) for inputs in self.inputs[:-1])
         starts = itertools.accumulate(sizes, initial=0)
@@ -61,18 +64,18 @@ class UpdateShape(NamedTuple):
 
     @property
     def slots(self) -> int:
-        """Return the number of sums of the policy that single samples add to."""
+        """Return the policy's sums over single samples: of head biases, deviations and metrics."""
         return self.outputs[0] + self.deviations + len(POLICY_METRICS)
 
     @property
     def policy_size(self) -> int:
         """Return the length of the policy's part of the vector."""
-        return self.hidden + self.width * self.outputs[0] + self.slots
+        return self.head_start + self.width * self.outputs[0] + self.slots
 
     @property
     def size(self) -> int:
         """Return the length of the vector."""
-        return self.policy_size + self.hidden + self.width + 1 + len(VALUE_METRICS)
+        return self.policy_size + self.head_start + self.width + 1 + len(VALUE_METRICS)
 
     @property
     def ranges(self) -> list[tuple[int, int]]:
@@ -90,26 +93,30 @@ class UpdateShape(NamedTuple):
         return places(sizes | dict.fromkeys(("reward", "discount", "truncation"), 1))
 
 
-class Minibatch(NamedTuple):
-    """A `Minibatch` says how much data of one policy there is, on one device."""
+class DataSizes(NamedTuple):
+    """A `DataSizes` holds the sizes of one replica's data on one device.
+
+    A size is 0 where the kernel does not depend on it.
+    """
 
     collected: int = 0
-    """Unrolls among which the minibatch's are."""
+    """Unrolls that a training step collects."""
     unrolls: int = 0
+    """Unrolls in a minibatch."""
     time: int = 0
     """Steps of an unroll."""
     minibatches: int = 1
-    """Number of minibatches of a training step, in all passes."""
+    """Minibatches of a training step, in all passes."""
     environments: int = 0
 
     @property
     def samples(self) -> int:
-        """Return the number of samples of the minibatch."""
+        """Return the samples in a minibatch."""
         return self.unrolls * self.time
 
 
-class Unroll(NamedTuple):
-    """An `Unroll` describes a step of an unroll."""
+class UnrollSpec(NamedTuple):
+    """An `UnrollSpec` says for which networks and environment an unroll's kernel is written."""
 
     shape: UpdateShape
     kernel: Kernel
@@ -117,7 +124,7 @@ class Unroll(NamedTuple):
     observation: int
     """Where the observation begins among the numbers of a state."""
     kept: tuple[int, ...]
-    """Places of the numbers that are kept of each state."""
+    """Which numbers of each state are kept."""
 
     @property
     def state(self) -> int:
@@ -128,7 +135,7 @@ class Unroll(NamedTuple):
 class LossTerms(NamedTuple, Generic[Number]):
     """A `LossTerms` holds the coefficients of the loss, under the names of the configuration.
 
-    The kernels read them from an array, because they may differ between policies.
+    The kernels read them from an array, because replicas may have different ones.
     """
 
     clipping_epsilon: Number

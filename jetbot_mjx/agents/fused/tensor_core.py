@@ -2,7 +2,7 @@
 
 A `GpuWriter` writes a kernel, which each thread of a block runs. Products of matrices are those of
 `mma.sync.m16n8k16`: a warp multiplies 16 x 16 float16 numbers by 16 x 8 and adds the result to
-16 x 8 float32 sums, of which each lane holds four:
+16 x 8 float32 sums, the accumulators, of which each lane holds four:
 
     lane = 4 g + t:  sums (g, 2t), (g, 2t + 1), (g + 8, 2t), (g + 8, 2t + 1)
 
@@ -20,7 +20,7 @@ LANES = 32
 """Threads of a warp."""
 
 TILE = 16
-"""Rows of a product, and numbers along its sum."""
+"""M and K of m16n8k16: the rows of a product, and the numbers that one step of its sum takes."""
 
 _QUAD = "{i32, i32, i32, i32}"
 _SUMS = "{float, float, float, float}"
@@ -28,8 +28,8 @@ _PAIR = "<2 x half>"
 _TOGETHER = "#0"
 """Attributes of a call for which the threads of a warp must stay together."""
 
-Sums = list[list[list[Value]]]
-"""Sums of a warp: four numbers of a lane for each (row tile of 16, column tile of 8)."""
+Accumulators = list[list[list[Value]]]
+"""Accumulators of a warp: four numbers of a lane for each (row tile of 16, column tile of 8)."""
 
 Operand = Callable[[int, int], list[Value]]
 """Return the fragments of an operand by its tile of 16 rows or columns and the step of the sum."""
@@ -38,7 +38,7 @@ Operand = Callable[[int, int], list[Value]]
 class GpuKernel(abc.ABC):
     """A `GpuKernel` writes one kernel, of which each thread of each block runs the same text.
 
-    The third axis of the grid is the policy, and each policy has a row of every array.
+    The third axis of the grid is the replica, and each replica has a row of every array.
     """
 
     name: str
@@ -57,26 +57,26 @@ class GpuKernel(abc.ABC):
         """Prepare to write.
 
         Args:
-          shapes: the shapes of all arrays for one policy.
+          shapes: the shapes of all arrays for one replica.
           blocks: the number of blocks along the first axis of the grid.
           threads: the threads of a block.
           shared_memory: the shared memory that a launch gives to each block [bytes].
         """
         self.shapes, self.blocks = shapes, blocks
         self.threads, self.shared_memory = threads, shared_memory
-        self.ir = GpuWriter(self.name, len(self.arguments) + len(self.returns))
+        self.w = GpuWriter(self.name, len(self.arguments) + len(self.returns))
 
     @abc.abstractmethod
     def text(self) -> str:
         """Return the kernel as a module of LLVM IR."""
 
-    def find_arrays(self, policy: Value) -> None:
-        """Set `arrays` to the addresses of a policy's rows."""
+    def find_arrays(self, replica: Value) -> None:
+        """Set `arrays` to the addresses of a replica's rows."""
         # Arguments that it changes are among the results, too, at the same addresses.
         names = dict.fromkeys((*self.arguments, *self.returns))
         self.arrays = {
-            name: self.ir.row(array, policy, math.prod(self.shapes[name]))
-            for name, array in zip(names, self.ir.parameters, strict=False)
+            name: self.w.row(array, replica, math.prod(self.shapes[name]))
+            for name, array in zip(names, self.w.parameters, strict=False)
         }
 
 
@@ -194,11 +194,13 @@ class GpuWriter(LlvmWriter):
         name = f"llvm.nvvm.ldmatrix.sync.aligned.m8n8.x4{kind}"
         return self._parts(self.call(name, place, result=_QUAD, suffix=_TOGETHER), "u32")
 
-    def zeros(self, rows: int, columns: int) -> Sums:
+    def zeros(self, rows: int, columns: int) -> Accumulators:
         """Return zeros as the sums of a warp's row and column tiles."""
         return [[[self.constant(0.0)] * 4 for _ in range(columns)] for _ in range(rows)]
 
-    def product(self, sums: Sums, steps: int, left: Operand, right: Operand) -> Sums:
+    def product(
+        self, sums: Accumulators, steps: int, left: Operand, right: Operand
+    ) -> Accumulators:
         """Return sums + left @ right.
 
         Args:

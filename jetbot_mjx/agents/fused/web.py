@@ -13,7 +13,7 @@ import numpy as np
 from jetbot_mjx.agents.fused import adam, arrays, sample_loss
 from jetbot_mjx.agents.fused.adam import AdamTerms, Progress
 from jetbot_mjx.agents.fused.arrays import Signature, Spec
-from jetbot_mjx.agents.fused.cpu_product import Matrix, multiply, product_functions
+from jetbot_mjx.agents.fused.cpu_product import Matrix, matmul, product_functions
 from jetbot_mjx.agents.fused.launch_cpu import call_of, misfit
 from jetbot_mjx.agents.fused.learner import FusedLearner, shape_of
 from jetbot_mjx.agents.fused.sample_loss import vector_of
@@ -69,7 +69,7 @@ def web_learner(
         "optimizer": {
             "max_grad_norm": config.max_grad_norm,
             "learning_rate": config.learning_rate,
-            "share": 1.0 / config.gradient_steps,
+            "fraction_per_step": 1.0 / config.gradient_steps,
             "desired_kl": config.desired_kl,
             "min_rate": config.learning_rate_schedule_min_lr,
             "max_rate": config.learning_rate_schedule_max_lr,
@@ -97,7 +97,7 @@ def network_texts(activation: str) -> dict[str, str]:
     w = LlvmWriter("net_product", *matrices, *sizes, convention="external")
     numbers = [x.to("u64") if x.type == "u32" else x for x in w.parameters]
     a, b, c = (Matrix(*numbers[i : i + 2]) for i in (0, 2, 4))
-    multiply(a, b, c, (numbers[6], numbers[7], numbers[8]), adds=True)
+    matmul(a, b, c, (numbers[6], numbers[7], numbers[8]), adds=True)
     products = product_functions(wasm.LANES, wasm.REGISTERS)
     return {"net_product": wasm.module_text([*products, w]), "net_activate": _activate(activation)}
 
@@ -134,7 +134,7 @@ def _policy_layers(shape: UpdateShape) -> list[dict[str, int]]:
         {"start": start, "inputs": inputs, "outputs": shape.width}
         for _, inputs, start in shape.hidden_layers
     ]
-    last = {"start": shape.hidden, "inputs": shape.width, "outputs": shape.outputs[0]}
+    last = {"start": shape.head_start, "inputs": shape.width, "outputs": shape.outputs[0]}
     return [*layers, last]
 
 
@@ -144,17 +144,17 @@ def _initial(shape: UpdateShape, action: Sequence[float] | None) -> list[dict[st
     Each entry says where numbers begin, how many there are, and the limit of their uniform
     distribution around 0, or their value.
     """
-    drawn: list[dict[str, float]] = []
+    entries: list[dict[str, float]] = []
     # The weights of both networks, by the initialiser of Brax: LeCun's, of variance 1 / inputs.
     for begin, outputs in zip((0, shape.policy_size), shape.outputs, strict=True):
         sizes = [(i, start, shape.width) for _, i, start in shape.hidden_layers]
-        for inputs, start, width in (*sizes, (shape.width, shape.hidden, outputs)):
+        for inputs, start, width in (*sizes, (shape.width, shape.head_start, outputs)):
             limit = math.sqrt(3.0 / inputs)
-            drawn.append({"start": begin + start, "count": inputs * width, "limit": limit})
+            entries.append({"start": begin + start, "count": inputs * width, "limit": limit})
     # The first action is that of the last layer's biases; the deviations may be parameters.
-    biases = shape.hidden + shape.width * shape.outputs[0]
+    biases = shape.head_start + shape.width * shape.outputs[0]
     means = np.zeros(0) if action is None else np.asarray(action)
     means = np.arctanh(means) if shape.distribution == "tanh_normal" else means
     values = [(biases + i, float(mean)) for i, mean in enumerate(means)]
     values += [(biases + shape.outputs[0] + i, 1.0) for i in range(shape.deviations)]
-    return drawn + [{"start": start, "count": 1, "value": value} for start, value in values]
+    return entries + [{"start": start, "count": 1, "value": value} for start, value in values]

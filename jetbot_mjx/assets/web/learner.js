@@ -21,7 +21,7 @@ class Trainer {
     this.arrays = {};
     for (const { arrays } of Object.values(about.functions))
       for (const [name, size] of arrays)
-        this.arrays[name] ??= memory.array(size, name === "unrolls" ? Int32Array : Float32Array);
+        this.arrays[name] ??= memory.array(size, name === "unroll_indices" ? Int32Array : Float32Array);
     const weights = about.initial.map(({ count }) => count), { noise, action_noise } = this.arrays;
     this.random = new Random(memory, seed, Math.max(...weights, noise.length, action_noise.length));
     const bytes = Math.max(...Object.values(about.functions).map((x) => x.scratch));
@@ -123,24 +123,25 @@ class Trainer {
 
   /** Lets the networks normalise by the statistics as they are now. */
   takeStatistics() {
-    const { statistics, about, observations: size } = this, { mean, scale } = this.arrays;
-    scale.view.fill(1);
+    const { statistics, about, observations: size } = this, { mean, inverse_std } = this.arrays;
+    inverse_std.view.fill(1);
     if (!about.normalizes_observations || statistics.count === 0) return;
     for (let i = 0; i < size; i++) {
       const deviation = Math.sqrt(Math.max(statistics.squares[i], 0) / statistics.count);
       mean.view[i] = statistics.mean[i];
-      scale.view[i] = 1 / Math.max(Math.min(Math.max(deviation, 1e-6), 1e6), about.smallest_deviations[i]);
+      inverse_std.view[i] = 1 / Math.max(Math.min(Math.max(deviation, 1e-6), 1e6), about.smallest_deviations[i]);
     }
   }
 
   /** Updates both networks in passes over the collected unrolls. */
   update() {
     const { about, arrays, random, updates } = this, { optimizer, progress } = about;
-    const { collected } = about.batch, unrolls = arrays.unrolls.view;
-    for (let pass = 0; pass < about.passes; pass++) unrolls.set(random.order(collected), pass * collected);
+    const { collected } = about.batch, indices = arrays.unroll_indices.view;
+    for (let pass = 0; pass < about.passes; pass++) indices.set(random.order(collected), pass * collected);
     const noise = arrays.noise.view;
     noise.set(random.numbers(noise.length, "normal"));
-    const terms = { ...optimizer, max_grad_norm: optimizer.max_grad_norm ?? Infinity, begun: updates * optimizer.share };
+    const terms = { ...optimizer, max_grad_norm: optimizer.max_grad_norm ?? Infinity };
+    terms.fraction_done = updates * optimizer.fraction_per_step;
     arrays.adam_terms.view.set(about.adam_terms.map((name) => terms[name]));
     // A row of the progress before each step of Adam, of which the first one is given.
     const rows = arrays.progress.view, [beta1, beta2] = about.betas;
@@ -154,11 +155,11 @@ class Trainer {
 
   /** Returns the policy as `Network` takes it. */
   policy() {
-    const params = this.arrays.params.view, { layers } = this.about, { mean, scale } = this.arrays;
+    const params = this.arrays.params.view, { layers } = this.about, { mean, inverse_std } = this.arrays;
     const last = layers.length - 1;
     return {
       mean: mean.view.slice(),
-      std: Float32Array.from(scale.view, (x) => 1 / x),
+      std: Float32Array.from(inverse_std.view, (x) => 1 / x),
       squash: this.about.shape.distribution === "tanh_normal",
       layers: layers.map(({ start, inputs, outputs }, i) => {
         const kept = i < last ? outputs : this.actions, end = start + inputs * outputs;
