@@ -307,8 +307,10 @@ def _train_loop(
         elapsed = time.perf_counter() - began
         chunk = next_chunk(count, elapsed, call_seconds)
         done, seconds, restart = done + count, seconds + elapsed, False
-        for device, seed in np.argwhere(found):
-            packed = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], nan_dumps)
+        # Of several devices the first that has a dump: it is stored under the steps alone.
+        for seed in np.flatnonzero(found.any(axis=0)):
+            at = found[:, seed].argmax(), seed
+            packed = jax.tree.map(lambda x, at=at: np.asarray(x)[at], nan_dumps)
             nan_dump = packed.replace(env_state=packed.env_state.unpack())
             recorder.on_nan_dump(int(seed), done * size, nan_dump)
         # Show the progress within an interval, and report at its end.

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from brax.training.types import UInt64
 
-from jetbot_mjx.agents import LOSSES, TALLIED
+from jetbot_mjx.agents import LOSSES, TALLIED, NanDump
 from jetbot_mjx.config import parse_config
-from jetbot_mjx.training.ppo_trainer import CompiledTrainer, _metrics
+from jetbot_mjx.packed import pack
+from jetbot_mjx.training.callbacks import TrainerCallback
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer, _metrics, _train_loop
 
 
 def test_to_take_the_seeds_apart_compiles_nothing():
@@ -54,3 +56,23 @@ def test_where_no_update_was_applied_there_is_no_loss():
     assert not {*LOSSES.values(), "policy/entropy"} & metrics.keys()
     assert metrics["train/nonfinite_updates"] == 32
     assert logged(0, 0, losses=0.0) == {}
+
+
+def test_a_call_stores_one_dump_of_each_seed_whatever_devices_found_one():
+    ppo = parse_config({"ppo": {"num_timesteps": 1}}).ppo
+    # Device 1 found one of seed 1, and device 2 of both.
+    found = np.array([[False, False], [False, True], [True, True]])
+    marks = np.arange(6, dtype=np.float32).reshape(3, 2)
+    dumps = NanDump(found, pack({"mark": marks}, batch_axes=2), marks, np.zeros((3, 2), np.int32))
+    told = []
+
+    class Recorder(TrainerCallback):
+        def on_nan_dump(self, seed_index, env_steps, nan_dump):
+            told.append((seed_index, env_steps, float(nan_dump.env_state["mark"])))
+
+    trainer = types.SimpleNamespace(ppo=types.SimpleNamespace(config=ppo), get=lambda state: [])
+    stop = types.SimpleNamespace(requested=False, notice=30.0)
+    advance = lambda state, steps, restart: (state, dumps)  # noqa: E731
+    _train_loop(trainer, advance, Recorder(), stop, 1, None, 0)
+    size = ppo.steps_per_training_step
+    assert told == [(0, size, 4.0), (1, size, 3.0)]
