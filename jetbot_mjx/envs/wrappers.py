@@ -129,7 +129,8 @@ class EpisodeWrapper(Wrapper):
       2. Step the environment up to `action_repeat` times, until the task or the time limit ends
          the episode. Reward and metrics of the repeated steps are summed.
       3. If state, observation or reward is not finite, discard the step: the state before it
-         remains, reward and metrics are 0, and the episode is truncated.
+         remains, reward and metrics are 0, and the episode is truncated. If the observation of a
+         reset is not finite, it is replaced by zeros, and the first step is discarded.
       4. Compute truncation and `done`: terminated excludes truncated.
       5. Add reward, length and metrics of the step to `episode_metrics`.
     """
@@ -154,7 +155,7 @@ class EpisodeWrapper(Wrapper):
         Args:
           rng: a random key.
         """
-        state = self.env.reset(rng)
+        state = _with_finite_obs(self.env.reset(rng))
         zero = jnp.zeros(())
         metrics = {**state.metrics, "nonfinite_envs": zero}
         info = {
@@ -398,6 +399,22 @@ class RandomizedBatchWrapper(BatchWrapper):
 def _episode_fields(state: State) -> tuple[PyTree, ...]:
     """Return the fields that belong to the episode and not to the last step."""
     return state.pipeline_state, state.obs, state.goal, state.key, state.episode_params
+
+
+def _with_finite_obs(state: State) -> State:
+    """Return the state after a reset, with an observation of zeros in place of a non-finite one.
+
+    Its physics is then NaN, so that the first step is not finite and ends the episode.
+    """
+    finite = _all_finite((state.obs, state.reward))
+
+    def spoil(x: PyTree) -> PyTree:
+        return jnp.where(finite, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+    return state.replace(
+        obs=jax.tree.map(lambda x: jnp.where(finite, x, jnp.zeros_like(x)), state.obs),
+        pipeline_state=jax.tree.map(spoil, state.pipeline_state),
+    )
 
 
 def _without_step(state: State) -> State:

@@ -485,6 +485,26 @@ def test_where_nothing_blew_up_there_is_no_fault(ours, smoke):
     assert not bool(nan_dump.found)
 
 
+class Unborn(Gliding):
+    """A world of which one in fifty begins with an observation that is not finite."""
+
+    def reset(self, rng):
+        state = super().reset(rng)
+        bad = jax.random.bernoulli(jax.random.fold_in(rng, 1), 1 / 50)
+        return state.replace(obs=jnp.where(bad, jnp.nan, state.obs))
+
+
+def test_a_first_observation_that_is_not_finite_does_not_reach_what_is_learned(smoke):
+    one = Jitted(smoke, Unborn(smoke))
+    begun = one.init(jax.random.PRNGKey(0))
+    state, nan_dump = one.advance(begun)
+    assert float(state.sums["nonfinite_envs"]) >= 1
+    assert float(state.sums["nonfinite_updates"]) == 0
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((state.params, state.normalizer)))
+    assert furthest(state.params, begun.params) > 1e-3
+    assert replayed(Unborn(smoke), smoke, nan_dump).index(1.0) == int(nan_dump.step)
+
+
 def test_the_linear_step_size_falls_to_nothing(brittle, begun, smoke):
     ppo = brittle.ppo.config
     per_step = ppo.num_minibatches * ppo.num_updates_per_batch

@@ -1,5 +1,7 @@
 """Termination, truncation and resets: with a stub that ends on demand, and with the robot."""
 
+import itertools
+
 import brax.envs
 import jax
 import jax.numpy as jnp
@@ -114,6 +116,31 @@ def test_a_non_finite_state_ends_the_episode_is_counted_and_reset():
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(state))
     assert float(after.metrics["nonfinite_envs"]) == 0
     np.testing.assert_array_equal(after.pipeline_state.qpos, 1.0)
+
+
+class Unborn(Stub):
+    """Some resets observe what is not finite."""
+
+    def reset(self, rng):
+        state = super().reset(rng)
+        return state.replace(obs=jnp.where(state.goal[0] < 0.5, jnp.nan, state.goal))
+
+
+def test_a_reset_that_is_not_finite_is_observed_as_zeros_and_its_first_step_is_counted():
+    env = NewEpisodeWrapper(EpisodeWrapper(Unborn(), EPISODE_LENGTH))
+    seen = []
+    for key in range(8):
+        states = run(env, [END] * 6, key)
+        for before, after in itertools.pairwise(states):
+            assert all(np.all(np.isfinite(x)) for x in (before.obs, before.info["final_obs"]))
+            is_bad = bool(before.goal[0] < 0.5)
+            assert np.any(before.obs) != is_bad
+            assert float(after.metrics["nonfinite_envs"]) == is_bad
+            assert float(after.info["truncation"]) == is_bad
+            assert float(after.done) == 1
+            assert float(after.reward) == 1 - is_bad
+            seen.append(is_bad)
+    assert 10 < sum(seen) < 38
 
 
 def test_brax_masks_the_step_of_a_non_finite_state():
