@@ -200,7 +200,7 @@ class ProgramWriter:
         writer: LlvmWriter,
         program: ScalarProgram,
         *,
-        approximate: bool = False,
+        fast_division: bool = False,
         for_gpu: bool = False,
     ) -> None:
         """Begin without values.
@@ -208,16 +208,17 @@ class ProgramWriter:
         Args:
           writer: the writer of the function; with one lane, values are scalars instead of vectors.
           program: the program, whose arguments must be float32.
-          approximate: whether division and square root may be off by some units in the last place,
-            as a GPU's own instructions for them are.
-          for_gpu: whether the function is for an NVIDIA GPU.
+          fast_division: whether division and square root may be off by some units in the last
+            place, as a GPU's own instructions for them are.
+          for_gpu: whether the function is for an NVIDIA GPU. Only such a function can run a program
+            that `scalarize` has lowered with `approximate`.
 
         Raises:
           UnsupportedError: an argument is not float32.
         """
         self._inputs = _inputs(program)
         self._writer = writer
-        self._on = Target(writer, "afn" if approximate else "", for_gpu)
+        self._on = Target(writer, "afn" if fast_division else "", for_gpu)
         self._program = program
         self._rest: list[Item] = program.block.items
         self._values: dict[int, Value | Callable[[], Value]] = {}

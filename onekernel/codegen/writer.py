@@ -24,6 +24,9 @@ tracers. This function multiplies the numbers of an array by a factor, up to a l
         array[i] = w.minimum(array[i] * factor, 1.0)
     text = module_text([w])
 
+A `for` of Python appends its body once for each element, so the function has it many times; inside
+`with w.loop` or `with w.repeat` it is appended once, and the function runs it many times.
+
 Types are strings. `i8`, `i32` and `i64` are integers with a sign, `u8`, `u32` and `u64` those
 without; LLVM's text writes both as `i8`, `i32` and `i64`, since there instructions have signs, and
 registers have none. `i1` is a truth value, `half`, `float` and `double` are numbers of 16, 32 and

@@ -66,16 +66,22 @@ done:
   ret void
 }
 
-; Takes blocks as long as there are any.
-define internal void @work(ptr %job) {
+; Returns memory to work with, which stays in the cache of a thread's core from block to block; null: there is none.
+define internal ptr @make_scratch() {
+  %bytes = load i64, ptr @scratch_bytes
+  ; Never none, of which null would be the address.
+  %some = call i64 @llvm.umax.i64(i64 %bytes, i64 64)
+  %scratch = call ptr @aligned_alloc(i64 64, i64 %some)
+  ret ptr %scratch
+}
+
+; Takes blocks as long as there are any, and frees the memory that it worked with.
+define internal void @work(ptr %job, ptr %scratch) {
 entry:
   %blocks.at = getelementptr %Job, ptr %job, i32 0, i32 3
   %blocks = load i64, ptr %blocks.at
   %ended = getelementptr %Job, ptr %job, i32 0, i32 1
   %mode = call i64 @begin()
-  ; Memory to work with, which stays in the cache of this thread's core from block to block.
-  %scratch.bytes = load i64, ptr @scratch_bytes
-  %scratch = call ptr @aligned_alloc(i64 64, i64 %scratch.bytes)
   br label %take
 take:
   %index = atomicrmw add ptr %job, i64 1 monotonic
@@ -93,9 +99,16 @@ done:
   ret void
 }
 
-; The function that XLA's other threads run. They may begin when the work is done and the call is over.
+; The function that XLA's other threads run. They may begin when the work is done and the call is over. A thread without
+; memory leaves the work to the others.
 define internal void @task(ptr %job) {
-  call void @work(ptr %job)
+  %scratch = call ptr @make_scratch()
+  %none = icmp eq ptr %scratch, null
+  br i1 %none, label %done, label %help
+help:
+  call void @work(ptr %job, ptr %scratch)
+  br label %done
+done:
   call void @release(ptr %job)
   ret void
 }
@@ -126,7 +139,22 @@ done:
 }
 
 ; Each function of XLA's interface takes the address of a structure: its size, an unused pointer, then the
-; arguments. Returns the number of XLA's threads (XLA_FFI_ThreadPool_NumThreads); one if it has none.
+; arguments.
+
+; Makes the error that there is no memory (XLA_FFI_Error_Create, with the code 8 of exhausted resources).
+@no_memory = internal constant [32 x i8] c"there is no memory for a kernel\00"
+define internal ptr @out_of_memory(ptr %api) {
+  %arguments = alloca [4 x i64]
+  store [4 x i64] [i64 28, i64 0, i64 0, i64 8], ptr %arguments
+  %message.at = getelementptr i8, ptr %arguments, i64 16
+  store ptr @no_memory, ptr %message.at
+  %function.at = getelementptr i8, ptr %api, i64 48
+  %function = load ptr, ptr %function.at
+  %error = call ptr %function(ptr %arguments)
+  ret ptr %error
+}
+
+; Returns the number of XLA's threads (XLA_FFI_ThreadPool_NumThreads); one if it has none.
 define internal i64 @thread_count(ptr %api, ptr %context) {
   %count = alloca i64
   store i64 1, ptr %count
@@ -190,8 +218,8 @@ done:
   ret void
 }
 
-; The function that XLA calls: it takes a call frame and returns no error. The frame's fields, by their offsets in
-; bytes: 8 extensions, 16 the interface, 24 the context, 40 the arguments, 80 the results.
+; The function that XLA calls: it takes a call frame, and returns null or an error. The frame's fields, by their offsets
+; in bytes: 8 extensions, 16 the interface, 24 the context, 40 the arguments, 80 the results.
 define ptr @kernel(ptr %frame) {
 entry:
   %extension.at = getelementptr i8, ptr %frame, i64 8
@@ -261,6 +289,9 @@ prepare:
   %end = getelementptr %Job, ptr null, i32 0, i32 5, i64 %count
   %bytes = ptrtoint ptr %end to i64
   %job = call ptr @malloc(i64 %bytes)
+  %no.job = icmp eq ptr %job, null
+  br i1 %no.job, label %fail, label %fill.job
+fill.job:
   store %Job { i64 0, i64 0, i64 1, i64 0, i64 0, [0 x ptr] zeroinitializer }, ptr %job
   %blocks.at = getelementptr %Job, ptr %job, i32 0, i32 3
   store i64 %blocks, ptr %blocks.at
@@ -272,14 +303,24 @@ prepare:
   call void @copy_addresses(ptr %buffers, i64 %argument.count, ptr %given.at)
   %returned.at = getelementptr %Job, ptr %job, i32 0, i32 5, i64 %argument.count
   call void @copy_addresses(ptr %outputs, i64 %result.count, ptr %returned.at)
+  %scratch = call ptr @make_scratch()
+  %no.scratch = icmp eq ptr %scratch, null
+  br i1 %no.scratch, label %free.job, label %count.threads
+free.job:
+  call void @free(ptr %job)
+  br label %fail
+fail:
+  %error = call ptr @out_of_memory(ptr %api)
+  ret ptr %error
   ; Ask for as many threads as XLA has, but not for more than the blocks are worth.
+count.threads:
   %threads = call i64 @thread_count(ptr %api, ptr %context)
   %per.thread = load i64, ptr @blocks_per_thread
   %useful = udiv i64 %blocks, %per.thread
   %most = call i64 @llvm.umin.i64(i64 %threads, i64 %useful)
   br label %help
 help:
-  %helpers = phi i64 [1, %prepare], [%helpers.next, %ask]
+  %helpers = phi i64 [1, %count.threads], [%helpers.next, %ask]
   %enough = icmp uge i64 %helpers, %most
   br i1 %enough, label %start, label %ask
 ask:
@@ -288,9 +329,10 @@ ask:
   br label %help
 ; Work like the others, and return when all blocks have ended.
 start:
-  call void @work(ptr %job)
+  call void @work(ptr %job, ptr %scratch)
   call void @wait_for(ptr %job, i64 %blocks)
   call void @release(ptr %job)
   ret ptr null
 }
 declare i64 @llvm.umin.i64(i64, i64)
+declare i64 @llvm.umax.i64(i64, i64)

@@ -10,6 +10,7 @@ The offsets are those of XLA's C header `xla/ffi/api/c_api.h`, version 0.3. Ever
 its size, and the function returns without a result if a size differs from the expected one.
 """
 
+import contextlib
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
@@ -211,9 +212,10 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
         row = start
         for array, size in zip(arrays, sizes, strict=False):
             begin = instance * size
-            for i in _indices(w, size):
-                value = array[begin + i]
-                (tile + (i + row) * lanes)[lane] = value
+            with _indices(w, size) as indices:
+                for i in indices:
+                    value = array[begin + i]
+                    (tile + (i + row) * lanes)[lane] = value
             row += size
         following = lane + 1
         loop.again(following < lanes, following)
@@ -234,9 +236,10 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
         instance, row = first + lane, 0
         for array, size in zip(arrays[len(sizes) :], results, strict=True):
             begin = instance * size
-            for i in _indices(w, size):
-                value = (tile + (i + row) * lanes)[lane]
-                array[begin + i] = value
+            with _indices(w, size) as indices:
+                for i in indices:
+                    value = (tile + (i + row) * lanes)[lane]
+                    array[begin + i] = value
             row += size
         following = lane + 1
         # Do not store the lanes beyond the last instance.
@@ -244,17 +247,18 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
     return w
 
 
-def _indices(w: LlvmWriter, size: int) -> Iterator[Value | int]:
-    """Yield the indices of an array, for each of which what is appended is run.
+@contextlib.contextmanager
+def _indices(w: LlvmWriter, size: int) -> Iterator[Iterable[Value | int]]:
+    """Yield the indices of an array, for each of which to append its accesses.
 
-    Those of a large array are one index, in a loop.
+    Those of a large array are one index, of a loop around what is appended inside.
     """
     # LLVM takes a time quadratic in the number of accesses: 20 s for 2,000.
     if size <= MAX_WRITTEN_OUT:
-        yield from range(size)
-        return
-    with w.loop(size) as i:
-        yield i
+        yield range(size)
+    else:
+        with w.loop(size) as i:
+            yield [i]
 
 
 def _map_functions(kernel: Kernel, items: int, lanes: int) -> list[LlvmWriter]:

@@ -46,7 +46,7 @@ are longer, the threads of a block copy them to shared memory and back together:
 threads copy neighbouring words, which a GPU does in one access. If each thread read its own row,
 the threads would wait 70 µs for 65,536 rows of 77 words."""
 
-_SHARED_MEMORY = {70: 49_152, 80: 98_304, 90: 98_304}
+_SHARED_BYTES = {70: 49_152, 80: 98_304, 90: 98_304}
 """Bytes of shared memory for these rows, by target architecture: all GPUs that can run code for the
 architecture have as much."""
 
@@ -126,7 +126,7 @@ def _shared_words(kernel: Kernel, architecture: int) -> int:
     shapes = kernel.argument_shapes, [x.shape for x in kernel.results()]
     words = max(sum(map(math.prod, one)) for one in shapes)
     # Even the smallest block must fit.
-    fits = 4 * _MIN_THREADS * words <= _SHARED_MEMORY[architecture]
+    fits = 4 * _MIN_THREADS * words <= _SHARED_BYTES[architecture]
     return words if words > _DIRECT_WORDS and fits else 0
 
 
@@ -248,7 +248,7 @@ def threads_in_block(instances: int, words: int = 0) -> int:
     most = MAX_THREADS
     if words:
         # As many instances as fit into the shared memory of a block.
-        fitting = _SHARED_MEMORY[target_architecture()] // (4 * words)
+        fitting = _SHARED_BYTES[target_architecture()] // (4 * words)
         most = min(most, 2 ** int(math.log2(fitting)))
     return min(max(wanted, _MIN_THREADS), most)
 

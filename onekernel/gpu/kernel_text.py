@@ -115,7 +115,7 @@ def map_kernel_text(kernel: Kernel) -> str:
     thread, instance = _register(w, "tid.x"), _register(w, "ctaid.x").to("u64")
     first = instance * items
     # Compute what all items share.
-    body = ProgramWriter(w, kernel.program, approximate=True, for_gpu=True)
+    body = ProgramWriter(w, kernel.program, fast_division=True, for_gpu=True)
     body.hoist(address.load() for address in _Rows(instance).addresses(given, sizes))
     # Compute the items of the thread.
     with w.when(thread < items), w.repeat(thread) as loop:

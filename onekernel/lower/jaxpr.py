@@ -15,9 +15,9 @@ Protocol, in the order in which a function passes through the package:
    loops and branches (`control_flow`).
 4. `schedule` places the operations in blocks, and `onekernel.codegen` writes the blocks as LLVM IR.
 
-Arguments for this protocol: the operations and their order are those of the function, so results
-differ from JAX's by round-off only, as long as all numbers are finite. (With `finite=False`
-functions are lowered whose numbers may not be.) The lowering knows nothing of instances.
+Why this is correct: the operations and their order are those of the function, so results differ
+from JAX's by round-off only, as long as all numbers are finite. Functions whose numbers may be
+infinite or NaN are lowered with `finite=False`. The lowering knows nothing of instances.
 """
 
 import dataclasses
@@ -180,7 +180,8 @@ def scalarize(
       function: a jittable function of one instance.
       *arguments: pytrees of arrays, or of objects with a shape and a dtype.
       finite: whether all numbers are finite, as for `ExprGraph`.
-      approximate: whether the program is for GPUs, and may have their approximate instructions.
+      approximate: whether exp, log and 1/x are operations, which only GPUs have instructions for:
+        approximate ones. Otherwise exp and log become polynomials.
 
     Returns:
       The program.
@@ -212,7 +213,7 @@ def scalarize_part(
       words: whether the program takes and returns float32 only. A number of another dtype of 32
         bits is then passed as a float32 with the same bits, and a bool as 0 or 1.
       finite: whether all numbers are finite, as for `ExprGraph`.
-      approximate: whether to use approximate instructions of GPUs, as for `ExprGraph`.
+      approximate: as for `scalarize`.
 
     Returns:
       The program.

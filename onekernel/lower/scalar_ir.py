@@ -5,16 +5,18 @@ with zero. Most entries of the matrices of physics are zeros, so most of the ari
 A `Loop` and a `Branch` are recorded as units; `schedule` decides in which block of the program each
 operation is computed.
 
-Scalars are in registers, which no index can choose. What an index that is not constant reads is in
-an array instead, in memory of the instance's own: one that holds given scalars (`ExprGraph.array`),
-or one to which a loop adds a scalar in every iteration (`Loop.stacked`). Both are operations
-whose value is an address, and which only `ExprGraph.load` takes as an operand. An array is never
-changed after it is complete, so loads have no order among each other.
+Scalars are in registers, which are chosen when the program is written. Where an index is known only
+when it runs, the scalars it chooses from are in memory instead, in an array of the instance's own:
+one that holds given scalars (`ExprGraph.array`), or one to which a loop adds a scalar in every
+iteration (`Loop.stacked`). Both are operations whose value is an address, and which only
+`ExprGraph.load` takes as an operand. An array is never changed after it is complete, so loads have
+no order among each other.
 
 Three simplifications hold for finite numbers only: 0·x, 0/x and x - x are 0. A graph for numbers
 that may be infinite or NaN goes without them, and reduces angles of any size.
 
-What an operation is simplified to, or replaced by, the graph is told (`simplify.make_graph`).
+The rules that simplify or replace operations are in `simplify`, which passes them to a new graph
+(`simplify.make_graph`).
 """
 
 import dataclasses

@@ -30,7 +30,7 @@ def make_graph(*, finite: bool = True, approximate: bool = False) -> ExprGraph:
 
     Args:
       finite: whether all numbers are finite, and angles at most 10⁴.
-      approximate: whether to record functions that GPUs have approximate instructions for.
+      approximate: whether to record exp, log and 1/x, which GPUs have approximate instructions for.
     """
     return ExprGraph(_SIMPLIFY | _APPROXIMATE if approximate else _SIMPLIFY, finite=finite)
 

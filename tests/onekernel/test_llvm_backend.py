@@ -22,6 +22,7 @@ from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.errors import UserError
 from onekernel import cpu, fuse, kernel
+from onekernel.codegen import LlvmWriter
 from onekernel.cpu import xla_call
 from onekernel.lower.jaxpr import scalarize
 
@@ -247,6 +248,24 @@ def tell():
     ends = np.asarray(on_all(states, held)).reshape(DEVICES, 500)
     assert (ends == ends[:, :1]).all()
     print(json.dumps([float(4.0 ** round(np.log(x) / np.log(4))) for x in ends[:, 0]]))
+
+
+@needs_it
+def test_a_call_without_memory_raises_and_the_next_one_runs():
+    def increment(scratch):
+        block = LlvmWriter("block", *cpu.BLOCK_PARAMETERS)
+        job, index, memory = block.parameters
+        memory[0] = cpu.array_of(job, 0)[index] + 1.0
+        cpu.array_of(job, 1)[index] = memory[0]
+        machine = cpu.host_processor().machine
+        text = cpu.call_text([block], blocks_per_thread=1, scratch=scratch, machine=machine)
+        return jax.jit(lambda x: cpu.launch_text(text, [x], [x])[0])
+
+    x = jnp.arange(20.0)
+    for _ in range(2):
+        with pytest.raises(jax.errors.JaxRuntimeError, match="there is no memory for a kernel"):
+            increment(2**62)(x).block_until_ready()
+    np.testing.assert_array_equal(increment(64)(x), x + 1)
 
 
 @needs_it
