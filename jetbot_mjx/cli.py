@@ -161,6 +161,7 @@ def run_command(
     """
     startup.protect_output()
     startup.keep_own_files()
+    startup.share_memory()
     # Run the command and convert known errors to an exit code.
     try:
         startup.collect_garbage_late()

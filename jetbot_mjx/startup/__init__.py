@@ -32,8 +32,8 @@ and Ctrl-C may wait for a compiler or print a traceback during imports:
     repeat_interrupts      raises Ctrl-C again where Python has printed and ignored it
     exit_if_stuck          lets Ctrl-C end a command that a compiler keeps busy
 
-The others here (`protect_output`, `keep_own_files`, `divide_cpu`) carry out what a command promises
-and a setting requests; they save no time, and are always on.
+The others here (`protect_output`, `keep_own_files`, `share_memory`, `divide_cpu`) carry out what a
+command promises and a setting requests; they save no time, and are always on.
 """
 
 import lazy_loader

@@ -12,3 +12,4 @@ from .process import collect_garbage_late as collect_garbage_late
 from .process import exit_at_once as exit_at_once
 from .process import keep_own_files as keep_own_files
 from .process import set_environment as set_environment
+from .process import share_memory as share_memory

@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 from jetbot_mjx import startup
 from jetbot_mjx.startup.switch import PLAIN_START
 
-ALWAYS = {"divide_cpu", "keep_own_files", "protect_output"}
+ALWAYS = {"divide_cpu", "keep_own_files", "protect_output", "share_memory"}
 """What `startup` exports and the switch does not turn off."""
 
 SET_BY_TESTS = {
@@ -131,3 +132,41 @@ def test_files_of_a_command_are_its_users(tmp_path, umask, mode):
     finally:
         os.umask(before)
     assert (tmp_path / "file").stat().st_mode & 0o777 == mode
+
+
+ARENAS = """
+import ctypes, sys, threading
+from jetbot_mjx import startup
+if sys.argv[2:]:
+    startup.share_memory()
+c = ctypes.CDLL(None)
+c.malloc.restype = ctypes.c_void_p
+together = threading.Barrier(16)
+def allocate():
+    together.wait()
+    c.malloc(1000)
+    together.wait()
+threads = [threading.Thread(target=allocate) for _ in range(16)]
+[one.start() for one in threads]
+[one.join() for one in threads]
+c.fopen.restype = ctypes.c_void_p
+file = ctypes.c_void_p(c.fopen(sys.argv[1].encode(), b"w"))
+c.malloc_info(0, file)
+c.fclose(file)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="arenas are GNU's")
+def test_threads_share_few_arenas(tmp_path, monkeypatch):
+    monkeypatch.delenv("MALLOC_ARENA_MAX", raising=False)
+    file = tmp_path / "arenas.xml"
+
+    def arenas(*arguments):
+        command = [sys.executable, "-c", ARENAS, str(file), *arguments]
+        subprocess.run(command, check=True)
+        return file.read_text("utf-8").count("<heap nr=")
+
+    assert arenas() > 2
+    assert arenas("shared") <= 2
+    monkeypatch.setenv("MALLOC_ARENA_MAX", "5")
+    assert 2 < arenas("shared") <= 5
