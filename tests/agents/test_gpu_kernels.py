@@ -78,6 +78,28 @@ def test_a_gradient_is_that_of_float64(name, batch, policies, capability, model)
         assert_is_gradient(vector.astype(np.float64), data, 0.01)
 
 
+@pytest.mark.parametrize("launcher", [launch_gpu, launch_cpu])
+@pytest.mark.parametrize("name", ["swish", "relu"])
+def test_a_ratio_that_overflows_makes_the_gradient_not_finite(name, launcher, model):
+    """So that Adam's step is left out: float16 and simplified programs must not hide it."""
+    if launcher is launch_gpu:
+        model()
+    shape, case = SHAPES[name], Case(SHAPES[name], DataSizes(20, 13, 10), (0, 0), 0)
+    made = [make_data(case, 0)]
+    arrays = [*stacked(made, *NETWORK, *DRAWN), terms_of(case)]
+    place, rows = shape.columns["log_prob"], signatures.GRADIENT.arguments.index("rows")
+    arrays[rows] = arrays[rows].copy()
+    # The actions were unlikely in the collection: exp overflows.
+    arrays[rows][..., place] = -1e4
+    run = functools.partial(launched_by, launcher, signatures.GRADIENT, shape)
+    (vector, *_) = run(arrays) if launcher is launch_gpu else jax.jit(run)(arrays)
+    start, stop = shape.ranges[0]
+    assert not np.isfinite(np.sum(np.square(vector[0, start:stop])))
+    # The value network does not know of it.
+    start, stop = shape.ranges[1]
+    assert np.isfinite(vector[0, start:stop]).all()
+
+
 @pytest.mark.parametrize("environments", [1, 150])
 @pytest.mark.parametrize("name", SHAPES)
 def test_actions_are_those_of_float64(name, environments, model):

@@ -25,6 +25,7 @@ from helpers.update_cases import (
 )
 from jetbot_mjx.agents.fused import arrays as signatures
 from jetbot_mjx.agents.fused import gpu_tiling, launch, launch_cpu
+from jetbot_mjx.agents.fused.adam import AdamRule
 from jetbot_mjx.agents.fused.gpu_actions import ActionKernel
 from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel
 from jetbot_mjx.agents.fused.gpu_gradient import GradientKernel
@@ -71,27 +72,45 @@ def test_the_advantages_are_those_of_float64(name):
         np.testing.assert_allclose(parts.sum(0), [advantage.sum(), squares], rtol=1e-4, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", slow_unless(lambda name: name != WARPS, CASES))
-def test_the_gradient_is_that_of_float64(name):
-    case = CASES[name]
-    made = [make_data(case, seed) for seed in range(case.seeds)]
+def gradients(case, made, parts):
+    """The gradients of a GPU's kernel, by the sums of the advantages and of their squares."""
     tiling = Tiling(case.shape, *case.gradient)
     blocks = min(case.blocks, tiling.tiles(case.batch))
-    kernel = GradientKernel(tiling, case.batch._replace(minibatches=COUNT), blocks, 3)
+    kernel = GradientKernel(tiling, case.batch._replace(minibatches=COUNT), blocks, parts.shape[1])
     estimated = [
         np.stack([x.astype(np.float32) for x in column])
         for column in zip(*((data.advantages, data.targets) for data in made), strict=True)
     ]
-    # The sums of the advantages in three parts.
-    thirds = [np.array_split(data.advantages.ravel(), 3) for data in made]
-    parts = np.array([[[x.sum(), (x**2).sum()] for x in third] for third in thirds], np.float32)
     result = np.full((case.seeds, blocks, case.shape.size), np.nan, np.float32)
     arrays = [*stacked(made, *NETWORK, "unroll_indices", "noise", "index"), *estimated, parts]
     arrays += [terms_of(case), result]
     sizes = kernel.threads, kernel.shared_memory
     simt.run(kernel.text(), arrays, (blocks, 2, case.seeds), *sizes)
-    for data, vectors in zip(made, result, strict=True):
-        assert_is_gradient(vectors.astype(np.float64).sum(0), data, 0.01)
+    return result.astype(np.float64).sum(1)
+
+
+@pytest.mark.parametrize("name", slow_unless(lambda name: name != WARPS, CASES))
+def test_the_gradient_is_that_of_float64(name):
+    case = CASES[name]
+    made = [make_data(case, seed) for seed in range(case.seeds)]
+    # The sums of the advantages in three parts.
+    thirds = [np.array_split(data.advantages.ravel(), 3) for data in made]
+    parts = np.array([[[x.sum(), (x**2).sum()] for x in third] for third in thirds], np.float32)
+    for data, vector in zip(made, gradients(case, made, parts), strict=True):
+        assert_is_gradient(vector, data, 0.01)
+
+
+@pytest.mark.parametrize("rounding", [-1e-6, -1e-7, 0.0, 1e-7])
+def test_advantages_that_are_nearly_equal_are_not_blown_up(rounding):
+    case = CASES["48 units"]
+    data = make_data(case, 0)
+    advantages = 300.0 + 1e-3 * data.advantages
+    sums = [advantages.sum(), (advantages**2).sum() * (1 + rounding)]
+    nearly_equal = [data._replace(advantages=advantages)]
+    (vector,) = gradients(case, nearly_equal, np.array([[sums]], np.float32))
+    # Normalised, they have a deviation of at most 1, and the largest ratio is 2.5.
+    (policy_loss, *_) = AdamRule(case.shape, case.batch.samples, "NONE", 1).metric_places
+    assert abs(vector[policy_loss]) <= 2.5 * case.batch.samples
 
 
 # Sizes that only CPUs take; parts of several unrolls, and the last one with fewer.

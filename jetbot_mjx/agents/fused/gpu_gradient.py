@@ -1,4 +1,4 @@
-"""Write the kernel that computes the gradient of PPO's loss with respect to both networks.
+"""Write the kernel that computes the gradient of PPO's loss for both networks.
 
 A block has 256 threads, serves one network (`ctaid.y`: 0 the policy, 1 the values), and loops over
 tiles of samples. Weights and activations are in shared memory as float16, all sums are float32,
@@ -21,6 +21,10 @@ _ONES = 0x3C003C00
 _LOSS_SCALE = 1 / 16
 """Loss scaling: of N samples, errors are stored in float16 as N/16 times the derivatives of the
 mean loss, because those of the mean underflow; `_put_sum` divides by it."""
+
+_LEAST_VARIANCE = 2**-20
+"""Least variance of the advantages relative to the square of their mean: the difference from which
+it is computed, E[x²] - E[x]² in float32, is about as uncertain."""
 
 
 class GradientKernel(NetworkKernel):
@@ -150,8 +154,7 @@ class GradientKernel(NetworkKernel):
                 * (1 / self.batch.samples)
                 for i in range(2)
             )
-            variance = square - mean * mean
-            variance = w.select(variance < 0.0, w.constant(0.0), variance)
+            variance = w.maximum(square - mean * mean, mean * mean * _LEAST_VARIANCE)
             self.write("statistics", 2 * LANES, mean)
             self.write("statistics", 2 * LANES + 1, w.reciprocal(w.sqrt(variance) + 1e-8))
 
@@ -211,7 +214,9 @@ class GradientKernel(NetworkKernel):
 
     def _take_results(self, results: list[Value], outputs: int) -> None:
         """Take what a loss returns: errors of so many outputs, and what is only summed up."""
-        # Rows beyond the last sample add nothing. The errors are the gradient of the head's biases.
+        # Rows beyond the last sample add nothing. The errors are the gradient of the head's biases,
+        # too, and float32 there: an error that is not finite reaches the norm, though `pack`
+        # replaces infinity by the largest float16.
         terms = [self.w.select(self.is_there, x, 0.0) for x in results]
         self._store_errors(terms[:outputs])
         self._add_to_slots(terms)

@@ -19,7 +19,7 @@ from jetbot_mjx.agents.fused.arrays import Actions
 from jetbot_mjx.agents.fused.shapes import LossTerms, UpdateShape
 from jetbot_mjx.devices import host_cpu
 
-_SHAPE = UpdateShape(4, 16, 1, 1, "tanh_normal", "tanh", normalizes=False)
+_SHAPE = UpdateShape(4, 16, 2, 1, "tanh_normal", "tanh")
 _TERMS = LossTerms(0.2, 0.01, 1.0, 0.9, 0.9, 1.0)
 _UNROLLS, _TIME = 8, 4
 _RULE = AdamRule(_SHAPE, _UNROLLS * _TIME, "NONE", steps=1)
