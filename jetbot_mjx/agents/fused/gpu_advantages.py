@@ -52,7 +52,7 @@ class AdvantageKernel(NetworkKernel):
         """Load the value network, and begin with sums of zero."""
         w = self.w
         index = self.arrays["index"].load("u32")
-        self.unrolls = w.row(self.arrays["unroll_indices"], index, self.batch.unrolls)
+        self.unroll_indices = w.row(self.arrays["unroll_indices"], index, self.batch.unrolls)
         self.terms = self.load_terms()
         self.load_network(self.arrays["params"] + self.shape.policy_size, w.constant(1, "u32"))
         return [w.constant(0.0)] * 2
@@ -66,7 +66,7 @@ class AdvantageKernel(NetworkKernel):
         """Return the unroll among the collected ones, and the pointer to the row of its step."""
         w, time = self.w, self.batch.time
         clamped = w.minimum(unroll, self.batch.unrolls - 1)
-        collected = (self.unrolls + clamped).load("u32")
+        collected = (self.unroll_indices + clamped).load("u32")
         collected_step = collected * time + w.minimum(step, time - 1)
         return collected, w.row(self.arrays["rows"], collected_step, self.shape.columns["size"])
 

@@ -83,7 +83,7 @@ class GradientKernel(NetworkKernel):
         self.own_tile = w.minimum(self.warp, self.width // TILE - 1) * TILE
         # Find the data of the minibatch, and the block's own gradient, of one of the networks.
         index, noise = self.arrays["index"].load("u32"), batch.samples * shape.actions
-        self.unrolls = w.row(self.arrays["unroll_indices"], index, batch.unrolls)
+        self.unroll_indices = w.row(self.arrays["unroll_indices"], index, batch.unrolls)
         self.noise = w.row(self.arrays["noise"], index, noise)
         start = self.network * shape.policy_size
         self.vector = w.row(self.arrays["gradients"], self.block, shape.size) + start
@@ -165,7 +165,7 @@ class GradientKernel(NetworkKernel):
         def place(row: Value) -> tuple[Value, Value, Value, Value]:
             sample = w.minimum(tile * self.tiling.rows + row, self.batch.samples - 1)
             unroll, step = sample // time, sample % time
-            collected = (self.unrolls + unroll).load("u32")
+            collected = (self.unroll_indices + unroll).load("u32")
             collected_row = w.row(self.arrays["rows"], collected * time + step, columns["size"])
             return sample, unroll, step, collected_row
 
