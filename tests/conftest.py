@@ -65,6 +65,7 @@ from helpers.durations import (  # noqa: F401
     pytest_sessionfinish,
     pytest_terminal_summary,
 )
+from helpers.further import mark_what_asks_for_slow_fixtures
 from helpers.stack import OneChunk
 from helpers.unpainted import unpainted
 from jetbot_mjx import fallbacks
@@ -79,16 +80,16 @@ _OWN_TASKS = program_key.BUILT_IN_TASKS
 program_key.BUILT_IN_TASKS = frozenset()
 
 _LONGEST = (
-    "test_ppo",
-    "test_preemption",
     "test_resumption",
-    "test_notebooks",
+    "test_fused",
+    "test_ppo",
+    "test_search",
+    "test_fused_learner",
     "test_library",
+    "test_llvm_codegen",
+    "test_mujoco",
     "test_evaluate",
-    "test_distributed",
-    "test_pretrained",
-    "test_eight_devices",
-    "test_torture",
+    "test_trust",
 )
 
 
@@ -96,8 +97,10 @@ def pytest_configure(config):
     config.pluginmanager.register(OneChunk())
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     """Begins with the files that take longest, so that no worker is left alone with one."""
+    mark_what_asks_for_slow_fixtures(items)
     rank = {name: index for index, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(_LONGEST)))
 

@@ -252,7 +252,7 @@ def plot(samples: Sequence[Sample], slopes: Sequence[Slope]) -> Figure:
         axes.plot(hours, values, ".", markersize=3)
         axes.plot(hours[first:], slope.mean + slope.slope * at, color="C1")
         title = QUANTITIES[slope.quantity] + (": drifts" if slope.drifts else "")
-        axes.set(title=title, xlabel="time [h]", ylim=(0, None))
+        axes.set(title=title, xlabel="time [h]", ylim=(0, 1.1 * max(values.max(), 1)))
         axes.grid(visible=True)
     return figure
 

@@ -19,6 +19,7 @@ import pytest
 import jetbot_mjx
 from helpers import point_mass
 from helpers.bare_python import NUMPY, alone, site_with
+from helpers.further import slow_fixture
 from jetbot_mjx import export, training
 from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks
 from jetbot_mjx.config import load_config, parse_config
@@ -605,7 +606,7 @@ def test_the_formats_and_the_folder_are_those_of_the_exporters():
 # Policies of an environment of one's own.
 
 
-@pytest.fixture(scope="module", params=["PointMass", "Choosing"])
+@slow_fixture(scope="module", params=["PointMass", "Choosing"])
 def own(request, tmp_path_factory):
     """A run in an environment of one's own, and its export."""
     run_dir = tmp_path_factory.mktemp("own") / "run"

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from helpers.further import slow_unless
+from helpers.further import slow_fixture, slow_unless
 from helpers.web_pages import shipped
 from jetbot_mjx.config import RandomizationConfig, RobotParams
 from jetbot_mjx.deployment.numpy_policy import as_jax
@@ -106,7 +106,7 @@ def nominal(env):
     return BatchWrapper(with_camera(KernelWrapper(one), env.camera))
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def drives(page):
     """The drive of the page's robots, and the package's."""
     env, commands = page.env, switching(round(SECONDS / page.env.dt))

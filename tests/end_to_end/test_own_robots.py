@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 
+from helpers.further import slow_fixture
 from helpers.own_robots import OWN_ROBOTS, copy_robot, load_robot
 from helpers.tiny import TINY
 from jetbot_mjx import evaluate, export, render
@@ -42,7 +43,7 @@ every_kind = pytest.mark.parametrize(
 )
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def trained(request, tmp_path_factory):
     """A run, and the folder that its files came from, which are gone."""
     folder = tmp_path_factory.mktemp("own")

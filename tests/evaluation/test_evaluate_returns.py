@@ -9,6 +9,7 @@ import pytest
 
 from helpers import point_mass
 from helpers.command_modules import evaluate
+from helpers.further import slow_fixture
 from jetbot_mjx import library, training
 from jetbot_mjx.errors import InvalidError, UserError
 from jetbot_mjx.evaluation import compare_runs, evaluate_returns, evaluate_run
@@ -17,7 +18,7 @@ from jetbot_mjx.runs import TaskCode
 EPISODES = 32
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def folder(tmp_path_factory):
     """A run of one seed and one of two, in an environment that tells successes."""
     folder = tmp_path_factory.mktemp("returns")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from helpers import gliding
+from helpers.further import slow_fixture
 from helpers.reports import make_episodes, polar
 from jetbot_mjx.agents.networks import make_policy
 from jetbot_mjx.evaluation import evaluate_run
@@ -50,7 +51,7 @@ def episodes(checkpoint, env):
     return jax.device_get(evaluator.run(checkpoint.params, report_keys(GOALS)))
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def seen(checkpoint, env, episodes):
     finder = MomentFinder(env, checkpoint.networks, ProgramCache({}))
     return finder.find(checkpoint.params, report_keys(GOALS), episodes)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from helpers import gliding
+from helpers.further import slow_fixture
 from jetbot_mjx.agents.networks import PolicyParams, make_networks
 from jetbot_mjx.config import LookParams, PPOConfig, RobotParams, parse_config
 from jetbot_mjx.envs.build import make_env
@@ -105,7 +106,7 @@ class Counted(DomainRandomizationWrapper):
         super().__init__(env, robot_params, **looks)
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def swept():
     """An untrained policy over two quantities, and how often the program was traced."""
     env = make_env(parse_config({"task": {"observation": "egocentric"}}))
@@ -146,7 +147,7 @@ def test_a_weak_robot_and_a_slow_answer_cost_success(swept):
     assert delay.scripted[1].success_rate < 0.8
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def swept_looks():
     """An untrained policy that sees, on a gliding robot: what it did under which looks."""
     camera = {"width": 16, "height": 16, "samples": 1}

@@ -32,6 +32,7 @@ from helpers.doc_pages import (
     own_files,
     reference,
 )
+from helpers.further import slow_fixture
 from jetbot_mjx import (
     cli,
 )
@@ -198,7 +199,7 @@ def test_lines_are_short(page):
     assert long == []
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def site(tmp_path_factory):
     for name in ("mkdocs", "material", "mkdocstrings_handlers.python"):
         pytest.importorskip(name)

@@ -178,6 +178,7 @@ def test_every_notebook_is_tested(root):
 # What follows asks for the kernel, which ends, and is paid for, with the last.
 
 
+@pytest.mark.slow
 def test_environment_notebook_runs(execute):
     notebook = execute("01_environment")
     assert images(notebook) == ["image/png"] * 2

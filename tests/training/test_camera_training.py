@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from helpers import gliding
+from helpers.further import slow_fixture
 
 pytest.importorskip("gymnasium")
 
@@ -66,7 +67,7 @@ def config_file(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def run(config_file):
     """A run that was never stopped."""
     run_dir = config_file.with_name("whole")

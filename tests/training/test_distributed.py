@@ -13,6 +13,7 @@ import pytest
 
 from helpers import gliding
 from helpers.command_modules import train
+from helpers.further import slow_fixture
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
@@ -78,7 +79,7 @@ class Ended:
         self.complained = re.sub(r"^\[Gloo\].*\n", "", self.err, flags=re.M)
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def alone(tmp_path_factory):
     """The same training by one process with two devices, and the folder it left."""
     run_dir = tmp_path_factory.mktemp("distributed") / "alone"

@@ -12,6 +12,7 @@ import pytest
 
 from helpers import gliding
 from helpers.eight_devices import DEVICES, SMOKE, STEPS, restored, said
+from helpers.further import slow_fixture
 from helpers.small_ppo import SIZE, lines, with_ppo
 from jetbot_mjx.config import ConfigError, load_config
 from jetbot_mjx.runs.checkpoint import load_checkpoint
@@ -24,7 +25,7 @@ def glide():
         yield
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def on_one(tmp_path_factory):
     """A run of one training step on one device, which the other process goes on with."""
     run_dir = tmp_path_factory.mktemp("devices") / "one"

@@ -17,6 +17,7 @@ import pytest
 
 from benchmarks.reliability import torture
 from helpers import gliding
+from helpers.further import slow_fixture
 from helpers.preemption_program import LISTENER
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps
 from jetbot_mjx.training.preemption import STOPPED, Preemption
@@ -110,7 +111,7 @@ def assert_saved_and_gone(process, code, number=signal.SIGTERM, doing=SAVING):
     assert process.unfinished == set()
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def undisturbed_run(tmp_path_factory):
     return tmp_path_factory.mktemp("preemption") / "undisturbed"
 

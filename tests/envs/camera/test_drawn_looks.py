@@ -9,6 +9,7 @@ import pytest
 
 from helpers import gliding
 from helpers.command_modules import train
+from helpers.further import slow_fixture
 from jetbot_mjx.config import ConfigError, LookParams, load_config, parse_config
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.camera.looks import Appearance
@@ -63,7 +64,7 @@ def ranges(root):
     return load_config(root / "configs" / "camera_real.yaml").randomization
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def drawn(ranges):
     return episodes(make_config(ranges.model_dump()), ENVS, EPISODES * LENGTH)
 
