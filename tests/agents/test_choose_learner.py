@@ -96,6 +96,7 @@ def assert_close(one, other):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), one, other)
 
 
+@pytest.mark.slow
 def test_in_the_place_of_kernels_xla_takes_and_returns_their_vectors():
     settings = config()
     kernels, xla = make_ppo(settings), make_ppo(config(update="xla"))

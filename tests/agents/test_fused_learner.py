@@ -616,6 +616,7 @@ def test_adam_serves_several_policies_at_once():
         assert float(alone[3][i + 1, -1]) == (i != 1)
 
 
+@pytest.mark.slow
 @pytest.mark.cpu
 @pytest.mark.parametrize(
     ("policies", "distribution", "schedule"),

@@ -237,6 +237,7 @@ def test_the_loss_of_separate_encoders_is_that_of_brax_s_networks(separate):
     assert_close(as_brax(gradient.value), their_gradient.value)
 
 
+@pytest.mark.slow
 def test_a_shared_encoder_learns_from_both_heads(separate):
     shapes = {PIXELS: SHAPE}
     params, batch, _ = separate

@@ -358,6 +358,7 @@ return {{ seen, blind, back: fleet.eyes.bytes.slice() }};
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_unless(lambda name: name == "camera_real", CAMERAS))
 def test_a_policy_that_takes_over_sees_what_is_there_now(name):
     page, count = shipped(name), 5

@@ -120,6 +120,7 @@ def test_without_a_difference_the_robot_drives_as_its_preset(driver, actions):
     np.testing.assert_allclose(varied.qpos[..., :7], preset.qpos[..., :7], atol=2e-5)
 
 
+@pytest.mark.slow
 def test_a_varied_robot_drives_as_one_compiled_with_its_numbers(driver, actions):
     env, drive = driver
     triples = [(m, f, *shift) for m in MASSES for f in FRICTIONS for shift in CENTRES]

@@ -45,7 +45,7 @@ def env(checkpoint):
     return checkpoint.make_env()
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def episodes(checkpoint, env):
     evaluator = Evaluator(env, checkpoint.networks, ProgramCache({}), record=True)
     return jax.device_get(evaluator.run(checkpoint.params, report_keys(GOALS)))

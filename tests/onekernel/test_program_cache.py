@@ -245,6 +245,7 @@ def test_what_this_process_has_found_there_before_is_compiled_once_more(jax_cach
     assert found(np.float32([0, 1, 2]))[1] == 9.0
 
 
+@pytest.mark.slow
 def test_what_a_cpu_still_finds_there_is_not_written(jax_cache, folder, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     monkeypatch.setattr(program_cache, "unseen_options", dict)

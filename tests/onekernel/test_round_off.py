@@ -61,6 +61,7 @@ CALLS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CALLS)
 def test_arithmetic_is_rounded_otherwise_wherever_it_is(name):
     # The arguments are whole, and so exact: all noise comes from inside.

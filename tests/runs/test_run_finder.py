@@ -139,6 +139,7 @@ def test_a_damaged_run_is_listed_with_the_reason_and_stops_no_other(runs, capsys
     assert said in damaged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "line",
     [

@@ -7,6 +7,7 @@ from jetbot_mjx.training import session
 from jetbot_mjx.training.result import summary
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "commands"),
     [("PointMass", ["evaluate", "export"]), ("Shown", ["evaluate", "export", "render"])],

@@ -68,6 +68,7 @@ def test_the_view_is_the_first_camera_or_follows_what_moves():
     assert np.isfinite(still.distance)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_rendered_is_refused_in_one_line(folder, tmp_path):
     with pytest.raises(UserError, match=r"--goals is for robots, and the run has environment = "):
         library.render(folder, goals=[1])
