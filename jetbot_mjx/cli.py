@@ -234,6 +234,10 @@ def _report_error(error: BaseException) -> int | None:
         case RuntimeError() if reason := errors.lost_device(error):
             print(f"error: the device failed: {errors.printable(reason)}", file=sys.stderr)
             return USER_ERROR
+        case OSError() if reason := errors.unanswered(error):
+            line = f"{errors.printable(reason)}: the drive does not answer"
+            print(f"error: {line}: give the same command again when it does", file=sys.stderr)
+            return USER_ERROR
         case KeyboardInterrupt():
             print("interrupted", file=sys.stderr)
             return INTERRUPTED

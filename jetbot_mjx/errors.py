@@ -172,6 +172,23 @@ def lost_device(error: BaseException) -> str:
     return clipped(next(iter(text.splitlines())), 200)
 
 
+NO_ANSWER = {
+    *(errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EINTR, errno.ENOTCONN, errno.ECONNRESET),
+    *(errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH),
+}
+"""Errors by which a drive, such as one on a network, says nothing of the file asked for."""
+
+
+def unanswered(error: OSError) -> str:
+    """Return the file for which a drive did not answer, and why; nothing for other errors."""
+    # Sockets have the same errors, but most of them not these, and name no file.
+    if error.errno not in NO_ANSWER or not (error.filename or error.errno in _OF_FILES):
+        return ""
+    return f"{error.filename or 'a file'}: {error.strerror}"
+
+
+_OF_FILES = {errno.EIO, errno.ESTALE}
+
 READER_LEFT = {errno.EPIPE, errno.EIO, errno.ECONNRESET}
 """Errors of a pipe, a terminal or a socket whose other end was closed."""
 

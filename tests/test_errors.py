@@ -1,5 +1,6 @@
 """Errors that the user can correct: one line each, short, with nothing that a terminal obeys."""
 
+import errno
 import io
 
 import pytest
@@ -16,6 +17,7 @@ from jetbot_mjx.errors import (
     ran_out,
     requires_extra,
     shown,
+    unanswered,
     write_error,
 )
 
@@ -101,3 +103,17 @@ def test_only_a_stream_that_keeps_its_error_has_one():
     assert write_error(io.TextIOWrapper(io.BufferedWriter(Kept()))) is Kept.error
     assert write_error(io.StringIO()) is None
     assert write_error(None) is None
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (OSError(errno.EIO, "Input/output error", "a/file"), "a/file: Input/output error"),
+        (OSError(errno.EIO, "Input/output error"), "a file: Input/output error"),
+        (TimeoutError(errno.ETIMEDOUT, "timed out", "a/file"), "a/file: timed out"),
+        (TimeoutError(errno.ETIMEDOUT, "timed out"), ""),
+        (FileNotFoundError(errno.ENOENT, "No such file", "a/file"), ""),
+    ],
+)
+def test_a_drive_that_does_not_answer_is_told_from_a_mistake(error, told):
+    assert unanswered(error) == told

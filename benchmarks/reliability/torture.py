@@ -254,12 +254,12 @@ def check_start(process: Process, known: Sequence[int]) -> None:
 
 
 class Aim(NamedTuple):
-    """An `Aim` holds the moment at which a process is killed."""
+    """An `Aim` holds the moment at which a process is disturbed."""
 
     event: str
     """The event to wait for: `started`, `trained`, `reported`, `saving` or `saved`."""
     delay: float
-    """The time between the event and the kill [s]."""
+    """The time between the event and the moment [s]."""
     count: int = 1
     """The number of occurrences in this process to wait for, for the last three events."""
 
@@ -320,9 +320,7 @@ def kill(
     # Kill the process at its moment.
     known = checkpoint_steps(run_dir)
     with Process(run_dir, settings, program, config) as process:
-        process.until(_condition(process, known, aim))
-        moment = time.monotonic() + aim.delay
-        process.until(lambda: time.monotonic() > moment)
+        reach(process, known, aim)
         printed, silence = process.stdout, process.seconds_silent
     # Check where it started from and what it left.
     check_start(process, known)
@@ -337,6 +335,22 @@ def kill(
     else:
         phase = _phase(printed, silence)
     return Kill(phase, len(left))
+
+
+def reach(process: Process, known: Sequence[int], aim: Aim) -> None:
+    """Wait for a moment of a process.
+
+    Args:
+      process: The process.
+      known: The environment steps of the checkpoints at its start.
+      aim: The moment.
+
+    Raises:
+      RecoveryError: The process ended before, or the wait timed out.
+    """
+    process.until(_condition(process, known, aim))
+    moment = time.monotonic() + aim.delay
+    process.until(lambda: time.monotonic() > moment)
 
 
 def _condition(process: Process, known: Sequence[int], aim: Aim) -> Callable[[], bool]:

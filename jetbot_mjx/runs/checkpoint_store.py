@@ -18,7 +18,9 @@ Protocol:
 4. Damage: a damaged checkpoint is never repaired or deleted. `resume` skips it, continues from the
    newest usable one, and moves those that are newer to `set_aside/`, so that the training can write
    its own under their names.
-5. Delete: a checkpoint that is removed is first moved to `.deleted`, so that a half-deleted one
+5. Drive: if a drive does not answer, as one on a network may for a while, that says nothing of what
+   it holds. Then an `UnreadableError` ends the training, and no checkpoint is skipped.
+6. Delete: a checkpoint that is removed is first moved to `.deleted`, so that a half-deleted one
    never has a valid name.
 
 Arguments for this protocol: arrays are stored by name, as NumPy arrays from the host, so that the
@@ -26,6 +28,7 @@ files depend neither on a Python class nor on the number of devices. The digests
 dtypes, shapes and bytes, so they reveal every change of the content.
 """
 
+import atexit
 import contextlib
 import hashlib
 import itertools
@@ -36,6 +39,7 @@ import os
 import re
 import shutil
 import stat
+import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,7 +49,14 @@ import numpy as np
 import tensorstore as ts
 from jaxtyping import PyTree
 
-from jetbot_mjx.errors import NotFoundError, UserError, clipped, os_errors, shown
+from jetbot_mjx.errors import (
+    NO_ANSWER,
+    NotFoundError,
+    UserError,
+    clipped,
+    os_errors,
+    shown,
+)
 from jetbot_mjx.runs.durable import make_folders, move
 from jetbot_mjx.runs.run_dir import JsonObject, read_text, remove
 
@@ -64,10 +75,15 @@ _STEP_DIGITS = 12
 _SPARE_BYTES = 1_000_000
 _DELETED = ".deleted"
 
+_CLOSED = "Event loop is closed"
+
 _UNSUSPECTED_BYTES = 1_000_000_000
 _MOST_COMPRESSED = 1_000
 """Arrays of more bytes than the first of these are read only if their files hold at least this part
 of them. Metadata alone can ask for any amount of memory."""
+
+_OS_ERROR = re.compile(r"os_error_code='(\d+)'")
+"""Matches the system's reason for an error of TensorStore."""
 
 _SOURCE_LOCATIONS = re.compile(r"\s*\[source locations='[^']*'\]")
 """Matches the list of its own source files that some releases of TensorStore add to an error."""
@@ -83,6 +99,10 @@ class CheckpointError(UserError):
 
 class CheckpointNotFoundError(CheckpointError, NotFoundError):
     """Raised when there is no checkpoint at a path."""
+
+
+class UnreadableError(UserError):
+    """Raised when a drive does not answer, so that nobody knows what it holds."""
 
 
 class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
@@ -101,14 +121,18 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
         Args:
           run_dir: the run folder, which must exist.
           keep: the number of latest checkpoints to keep, besides the first and the best.
+
+        Raises:
+          CheckpointError: the folder cannot be written.
+          UnreadableError: the drive does not answer.
         """
         self._scores = {step: stored_score(run_dir, step) for step in checkpoint_steps(run_dir)}
         self._keep = keep
         self._manager: ocp.CheckpointManager | None = None
-        self._log = contextlib.ExitStack()
+        self._log, self._failed = contextlib.ExitStack(), False
         self._folder = (run_dir / FOLDER).absolute()
-        self._clear_deleted()
         with self._writing():
+            self._clear_deleted()
             make_folders(self._folder)
 
     def save(
@@ -132,13 +156,14 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
         Raises:
           CheckpointError: this checkpoint, or the one before, could not be written.
         """
-        self._clear_deleted()
         # Brax's counters stay JAX arrays even on the host, so convert every leaf to NumPy.
         flat = {
             name: {key: np.asarray(x) for key, x in flatten(tree).items()}
             for name, tree in trees.items()
         }
-        self._check_space(sum(x.nbytes for tree in flat.values() for x in tree.values()))
+        with self._writing():
+            self._clear_deleted()
+            self._check_space(sum(x.nbytes for tree in flat.values() for x in tree.values()))
         # Add the digests by which a reader recognises damage.
         digests = {name: digest(tree) for name, tree in flat.items()}
         about = {**about, "env_steps": env_steps, _SCORE: score, _DIGESTS: digests}
@@ -161,10 +186,17 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
 
     def __exit__(self, *exception: object) -> None:
         """Wait until all checkpoints are on disk, and close the store."""
-        if self._manager is not None:
-            with self._log, self._writing():
-                self._manager.close()
-        remove(self._folder / _DELETED)
+        try:
+            with self._writing():
+                if self._manager is not None:
+                    self._manager.close()
+                remove(self._folder / _DELETED)
+        finally:
+            if self._failed:
+                # Threads of Orbax may still report what the caller knows.
+                atexit.register(self._log.close)
+            else:
+                self._log.close()
 
     def _clear_deleted(self) -> None:
         deleted = self._folder / _DELETED
@@ -189,10 +221,13 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """Convert every exception of a failed write by Orbax to a one-line `CheckpointError`."""
+        """Convert every exception of a failed write to a one-line `CheckpointError`."""
         try:
             yield
+        except UserError:
+            raise
         except Exception as error:
+            self._failed = True
             raise CheckpointError(
                 f"{self._folder}: a checkpoint could not be written: {_reason(error)}; the earlier"
                 " ones are unchanged"
@@ -204,33 +239,45 @@ def _without_log() -> Iterator[None]:
     """Keep Orbax from logging inside the context; what others log remains.
 
     Orbax logs every step of its work at INFO, and recommendations at WARNING. At ERROR it logs
-    tracebacks from each of its threads for errors that it raises as well.
+    tracebacks from each of its threads for errors that it raises as well. After the first error
+    TensorStore still reports the others, to an event loop that Orbax has closed.
     """
     orbax, root = logging.getLogger("absl"), logging.getLogger()
-    none = logging.NullHandler()
-    orbax.addFilter(_is_not_of_orbax)
+    none, hook = logging.NullHandler(), sys.unraisablehook
+
+    def is_shown(record: logging.LogRecord) -> bool:
+        return "orbax" not in Path(record.pathname).parts
+
+    def report(lost: "sys.UnraisableHookArgs") -> None:
+        if str(lost.exc_value) != _CLOSED:
+            hook(lost)
+
+    sys.unraisablehook = report
+    orbax.addFilter(is_shown)
     # As long as there is no handler, its logger adds one that writes to standard error.
     root.addHandler(none)
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         root.removeHandler(none)
-        orbax.removeFilter(_is_not_of_orbax)
-
-
-def _is_not_of_orbax(record: logging.LogRecord) -> bool:
-    """Return whether to log a record: not if Orbax logs it."""
-    return "orbax" not in Path(record.pathname).parts
+        orbax.removeFilter(is_shown)
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:
-    """Return the environment steps of a run's complete checkpoints in ascending order."""
-    folder = run_dir / FOLDER
-    if not folder.is_dir():
-        return []
-    found = (int(path.name) for path in folder.iterdir() if path.name.isdecimal())
+    """Return the environment steps of a run's complete checkpoints in ascending order.
+
+    Raises:
+      UnreadableError: they cannot be listed.
+    """
+    with os_errors(f"{run_dir / FOLDER} cannot be read", UnreadableError):
+        try:
+            names = os.listdir(run_dir / FOLDER)
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+    found = {int(name) for name in names if name.isdecimal()}
     # Skip folders that spell the number differently: this project did not write them.
-    return sorted(step for step in set(found) if os.path.lexists(checkpoint_path(run_dir, step)))
+    return sorted(step for step in found if checkpoint_path(run_dir, step).name in names)
 
 
 def checkpoint_path(run_dir: Path, env_steps: int) -> Path:
@@ -271,11 +318,14 @@ def read_about(path: Path, required: Sequence[str] = ()) -> JsonObject:
 
     Raises:
       CheckpointError: the metadata is missing or incomplete, or changed after it was written.
+      UnreadableError: the drive does not answer.
     """
     # Read the file and compare it with its own digest.
     file = path / _ABOUT / "metadata"
     try:
-        about = json.loads(read_text(file))
+        with _answers(path):
+            text = read_text(file)
+        about = json.loads(text)
         stored_digest = about[_DIGESTS].pop(_ABOUT)
         is_intact = stored_digest == _digest_json(about)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
@@ -313,6 +363,7 @@ def read_tree(path: Path, name: str, template: PyTree) -> PyTree:
     Raises:
       CheckpointError: the tree is missing, has other names, shapes or dtypes, cannot be read, or
         changed after it was written.
+      UnreadableError: the drive does not answer.
     """
     about = read_about(path)
     if name not in about[_DIGESTS]:
@@ -320,12 +371,13 @@ def read_tree(path: Path, name: str, template: PyTree) -> PyTree:
     wanted, folder = flatten(template), path / name
     try:
         table = about.get(_JOINED, {}).get(name)
-        if table is None:
-            flat = _read_arrays(folder, wanted)
-        else:
-            _compare(folder, wanted, _shapes(table))
-            flat = _split(folder, table)
-    except CheckpointError:
+        with _answers(path):
+            if table is None:
+                flat = _read_arrays(folder, wanted)
+            else:
+                _compare(folder, wanted, _shapes(table))
+                flat = _split(folder, table)
+    except UserError:
         raise
     except OSError as error:
         raise CheckpointError(
@@ -369,6 +421,28 @@ def stored_score(run_dir: Path, env_steps: int) -> float:
     return score if isinstance(score, int | float) and math.isfinite(score) else -math.inf
 
 
+@contextlib.contextmanager
+def _answers(path: Path) -> Iterator[None]:
+    """Convert an error of a drive that does not answer to an `UnreadableError`."""
+    try:
+        yield
+    except Exception as error:
+        if (number := _error_number(error)) not in NO_ANSWER:
+            raise
+        raise UnreadableError(
+            f"checkpoint {path} cannot be read now: {os.strerror(number)}: it may be intact: give"
+            " the same command again when the drive answers"
+        ) from None
+
+
+def _error_number(error: Exception) -> int | None:
+    """Return the number of the system's error that Python or TensorStore reports."""
+    if isinstance(error, OSError):
+        return error.errno
+    found = _OS_ERROR.search(str(error))
+    return int(found[1]) if found else None
+
+
 def _digest_json(values: JsonObject) -> str:
     text = json.dumps(values, sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -380,10 +454,12 @@ def _read_arrays(folder: Path, wanted: Mapping[str, _Typed]) -> dict[str, np.nda
     Orbax itself reads in threads. If one of them fails, the others print tracebacks that the
     caller cannot catch.
     """
-    if not folder.is_dir():
+    try:
+        os.listdir(folder)
+    except (FileNotFoundError, NotADirectoryError):
         raise CheckpointError(
             f"checkpoint {folder.parent} cannot be read: {folder.name} is missing"
-        )
+        ) from None
     stored_bytes = _count_bytes(folder)
     # TensorStore refuses a path with `..` in it.
     files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder.resolve()}/"}}
@@ -417,13 +493,12 @@ def _count_bytes(folder: Path) -> int:
     for parent, _, names in os.walk(folder):
         for file in (Path(parent, name) for name in names):
             status = file.stat()
-            is_regular = stat.S_ISREG(status.st_mode)
-            if not is_regular or not os.access(file, os.R_OK):
-                reason = "permission denied" if is_regular else "it is not a regular file"
+            if not stat.S_ISREG(status.st_mode):
                 name = file.relative_to(folder.parent)
                 raise CheckpointError(
-                    f"checkpoint {folder.parent} cannot be read: {name}: {reason}"
+                    f"checkpoint {folder.parent} cannot be read: {name}: it is not a regular file"
                 )
+            os.close(os.open(file, os.O_RDONLY))
             total += status.st_size
     return total
 
@@ -472,8 +547,10 @@ def _split(folder: Path, table: _Table) -> dict[str, np.ndarray]:
 def _reason(error: Exception) -> str:
     """Return the reason for an error in one line of at most 305 characters.
 
-    Locations in the source of other libraries are left out.
+    It is the system's if it is known. Locations in the source of other libraries are left out.
     """
+    if number := _error_number(error):
+        return os.strerror(number)
     text = _SOURCE_LOCATIONS.sub("", str(error))
     lines = text.strip().splitlines() or [type(error).__name__]
     # A message of TensorStore begins with the operation and ends with the cause: keep both ends.

@@ -60,6 +60,7 @@ def resume(
 
     Raises:
       CheckpointError: there are checkpoints, but none of them can be used. No file is changed.
+      UnreadableError: the drive does not answer. No file is changed.
     """
     # Try the steps from the newest to the oldest, until all seeds can be read at one of them.
     known = sorted(
@@ -92,8 +93,6 @@ def resume(
 
 def _read(path: Path, config: Config, template: TrainState) -> tuple[TrainState, JsonObject]:
     """Return the training state and the recorder's progress that a checkpoint holds."""
-    if not path.is_dir():
-        raise CheckpointError(f"checkpoint {path} is missing")
     about = explanation(path)
     try:
         parse_config(about["config"], source="stored config").check_resume(config)

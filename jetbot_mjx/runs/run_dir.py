@@ -164,10 +164,12 @@ def stored_config(run_dir: Path) -> Config | None:
     with os_errors(f"--run-dir {run_dir} cannot be used"):
         if not run_dir.exists():
             return None
-        if run_dir.is_dir() and os.path.lexists(run_dir / CONFIG):
-            return read_config(run_dir)
-        if run_dir.is_dir() and all(path.name.startswith(".") for path in run_dir.iterdir()):
-            return None
+        if run_dir.is_dir():
+            names = os.listdir(run_dir)
+            if CONFIG in names:
+                return read_config(run_dir)
+            if all(name.startswith(".") for name in names):
+                return None
     raise UserError(f"--run-dir {run_dir} exists and holds no run (no {CONFIG}): name a new folder")
 
 
@@ -188,7 +190,7 @@ def occupied(run_dir: Path) -> Iterator[None]:
     except OSError as error:
         reason = error.strerror or f"{path.name} is not a regular file"
         raise UserError(f"--run-dir {run_dir} cannot be written: {reason}") from None
-    with file:
+    try:
         try:
             if fcntl is None:
                 line = "this system has no locks: start no second training in this run folder"
@@ -208,6 +210,10 @@ def occupied(run_dir: Path) -> Iterator[None]:
             file.truncate(0)
             print(os.getpid(), file=file, flush=True)
         yield
+    finally:
+        # All of it is written, and a drive that does not answer may refuse this too.
+        with contextlib.suppress(OSError):
+            file.close()
 
 
 def write_run(run_dir: Path, config: Config, made_with: JsonObject) -> None:

@@ -136,8 +136,5 @@ def find_code(config: Config, run_dirs: Sequence[Path]) -> tuple[type | None, Ta
 
 
 def _has_checkpoints(run_dirs: Sequence[Path]) -> bool:
-    """Return whether there is a run to continue; a folder that cannot be read is refused later."""
-    try:
-        return any(map(checkpoint_steps, run_dirs))
-    except OSError:
-        return False
+    """Return whether there is a run to continue."""
+    return any(map(checkpoint_steps, run_dirs))

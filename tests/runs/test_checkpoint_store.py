@@ -261,9 +261,7 @@ def test_a_write_that_fails_on_the_way_costs_one_line_and_no_other_checkpoint(
     save(run_dir, 1)
     long = {"weights": np.random.default_rng(0).random(50_000)}
     said = refused(lambda: save(run_dir, 2, tree=long))
-    assert "a checkpoint could not be written: " in said
-    assert "Failed to write" in said
-    assert "the earlier ones are unchanged" in said
+    assert "a checkpoint could not be written: File too large; the earlier ones are" in said
     assert checkpoint_steps(run_dir) == [1]
     assert digest(read(run_dir, 1)) == digest(TREE)
     short_files()
@@ -293,13 +291,13 @@ def test_a_long_reason_keeps_its_beginning_and_its_end(run_dir, monkeypatch):
     def fail(*arguments, **keywords):
         # Some releases of TensorStore add where in their source they noticed.
         places = "\\n".join(f"tensorstore/kvstore/transaction.cc:{line}" for line in range(99))
-        told = f" No space left [os_error_code='28'] [source locations='{places}']"
+        told = f" the end [source locations='{places}']"
         raise ValueError("RESOURCE_EXHAUSTED: " + 1_000 * "x" + told + "\nand more")
 
     monkeypatch.setattr(ocp.CheckpointManager, "save", fail)
     said = refused(save, run_dir, 1)
     assert "RESOURCE_EXHAUSTED: xxx" in said
-    assert "xxx No space left [os_error_code='28']; the earlier" in said
+    assert "xxx the end; the earlier" in said
     assert len(said) < 600
 
 

@@ -28,12 +28,13 @@ from jetbot_mjx.config import CHANGEABLE_ON_RESUME
 from jetbot_mjx.devices import compiler_options
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator
-from jetbot_mjx.runs import Setup, metrics
+from jetbot_mjx.runs import Setup, checkpoint_store, metrics
 from jetbot_mjx.runs.checkpoint import POLICY
 from jetbot_mjx.runs.checkpoint_store import (
     FOLDER,
     CheckpointError,
     CheckpointStore,
+    UnreadableError,
     checkpoint_path,
     checkpoint_steps,
     digest,
@@ -473,8 +474,8 @@ DAMAGES = {
     "a foreign checkpoint": (a_foreign_checkpoint, "is not one of jetbot_mjx"),
     "renamed": (rename, "was renamed: it was written after 65536 steps"),
     "an empty folder": (an_empty_folder, "is not one of jetbot_mjx"),
-    "a file": (a_file, "000000065536 is missing"),
-    "a dangling link": (a_dangling_link, "000000065536 is missing"),
+    "a file": (a_file, "about/metadata is missing"),
+    "a dangling link": (a_dangling_link, "about/metadata is missing"),
 }
 
 
@@ -503,6 +504,43 @@ def test_a_damaged_checkpoint_is_skipped_and_the_one_before_is_taken(
 
 def test_the_damages_are_of_many_kinds():
     assert len(DAMAGES) >= 20
+
+
+def no_answer(*given, **named):
+    raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
+def no_answer_to_tensorstore(*given, **named):
+    raise ValueError("UNKNOWN: Error opening driver: Input/output error [os_error_code='5']")
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "fail"),
+    [
+        (os, "listdir", no_answer),
+        (checkpoint_store, "read_text", no_answer),
+        (checkpoint_store, "_count_bytes", no_answer),
+        (checkpoint_store.ts, "open", no_answer_to_tensorstore),
+    ],
+)
+def test_a_drive_that_does_not_answer_costs_no_checkpoint(
+    run_copy, states, config, template, monkeypatch, place, name, fail
+):
+    with monkeypatch.context() as patch:
+        patch.setattr(place, name, fail)
+        with pytest.raises(UnreadableError, match="Input/output error") as caught:
+            resume([run_copy], [config], template)
+    assert "\n" not in str(caught.value)
+    assert not (run_copy / "set_aside").exists()
+    assert digest(resume([run_copy], [config], template).states[0]) == digest(states[LAST])
+
+
+def test_the_best_checkpoint_does_not_lose_its_score_while_the_drive_does_not_answer(
+    run_copy, monkeypatch
+):
+    monkeypatch.setattr(checkpoint_store, "read_text", no_answer)
+    with pytest.raises(UnreadableError):
+        CheckpointStore(run_copy, keep=1)
 
 
 HARMLESS = {
@@ -879,7 +917,7 @@ FULL = {
     "volume": (full_volume, "checkpoints: the disk is full"),
     "log": (full_log, "cannot be written: No space left on device"),
     "tensorboard": (full_tensorboard, "cannot be written: No space left on device"),
-    "store": (full_store, "could not be written: [Errno 28] No space left on device; the earlier"),
+    "store": (full_store, "could not be written: No space left on device; the earlier"),
 }
 
 

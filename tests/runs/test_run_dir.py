@@ -84,6 +84,15 @@ def test_a_folder_is_free_when_the_process_that_held_it_was_killed(tmp_path):
             assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
 
 
+def test_a_drive_that_refuses_to_close_the_lock_changes_nothing(tmp_path, monkeypatch):
+    held = []
+    monkeypatch.setattr(run_dir.fcntl, "flock", lambda file, how: held.append(file))
+    with occupied(tmp_path):
+        # Its close now fails.
+        os.close(held[0].fileno())
+    assert held[0].closed
+
+
 def test_a_file_system_without_locks_refuses_nothing(tmp_path, monkeypatch):
     def fail(*arguments):
         raise OSError(95, "Operation not supported")

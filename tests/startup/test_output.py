@@ -112,3 +112,18 @@ def test_a_slow_reader_of_a_pipe_that_does_not_block_gets_all(tmp_path):
     with process, os.fdopen(reader) as stream:
         assert len(stream.read()) == 3 * 50_001
     assert process.returncode == 0
+
+
+def test_a_drive_that_does_not_answer_costs_one_line(tmp_path):
+    source = """
+        import errno, os
+        from jetbot_mjx import cli
+
+        def command(_):
+            raise OSError(errno.EIO, os.strerror(errno.EIO), "run/page.html")
+
+        cli.run_command(command, at_once=True)
+        """
+    said = "run/page.html: Input/output error: the drive does not answer"
+    line = f"error: {said}: give the same command again when it does\n"
+    assert python(tmp_path, source, "") == (2, line)
