@@ -160,8 +160,11 @@ def ran_out(error: Exception) -> bool:
     return "RESOURCE_EXHAUSTED" in str(error)
 
 
-_LOST = ("CUDA_ERROR_", "DATA_LOSS:", "UNAVAILABLE:", "failed to synchronize", "device is lost")
-"""What JAX's error says if a device failed, and not the program: it may have been taken away."""
+_LOST = (
+    *("CUDA_ERROR_", "DATA_LOSS:", "UNAVAILABLE:", "failed to synchronize", "device is lost"),
+    *("Gloo ", "NCCL operation", "ncclRemoteError"),
+)
+"""What JAX's error says if a device or another process of the training failed, not the program."""
 
 
 def lost_device(error: BaseException) -> str:

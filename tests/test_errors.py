@@ -82,6 +82,7 @@ def test_a_device_that_ran_out_of_memory_is_told_from_other_failures():
     [
         ("INTERNAL: CUDA_ERROR_ILLEGAL_ADDRESS: an error\nmore", "INTERNAL: CUDA_ERROR_ILLEGAL"),
         ("UNAVAILABLE: the device is gone", "UNAVAILABLE: the device is gone"),
+        ("UNKNOWN: Gloo all-reduce failed: reset by peer", "UNKNOWN: Gloo all-reduce failed"),
         ("RESOURCE_EXHAUSTED: CUDA_ERROR_OUT_OF_MEMORY: failed to allocate", ""),
         ("INVALID_ARGUMENT: shapes differ", ""),
     ],

@@ -93,7 +93,8 @@ def run(
                 result = _train_with_brax(training)
             else:
                 result = _train(training, stop or DeferredSignals(config.preemption_notice))
-        except jax.errors.JaxRuntimeError as error:
+        # Between several processes JAX raises the second kind as well.
+        except (jax.errors.JaxRuntimeError, ValueError) as error:
             if not (line := _explain(error, training)):
                 raise
             raise UserError(line) from None

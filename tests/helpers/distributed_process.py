@@ -20,9 +20,9 @@ from jetbot_mjx.training.callbacks import TrainerCallback
 def main():
     """Run the command, one training step a call.
 
-    The first argument says `interrupted` for a SIGTERM at each report, and `-` for none.
+    The first argument names a signal that it gets after each training step, and is `-` for none.
     """
-    interrupted, *arguments = sys.argv[1:]
+    name, *arguments = sys.argv[1:]
     ppo_trainer.next_chunk = lambda steps, seconds, wanted: 1
     report = ppo_trainer._report
 
@@ -39,11 +39,11 @@ def main():
         return report(trainer, recorder, state, seconds)
 
     def interrupt(self, env_steps, metrics, seconds):
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.Signals[name])
         time.sleep(0.5)
 
     ppo_trainer._report = reported
-    if interrupted == "interrupted":
+    if name != "-":
         TrainerCallback.on_progress = interrupt
     with gliding.everywhere():
-        cli.run_command(lambda _: train.main(arguments))
+        cli.run_command(lambda _: train.main(arguments), at_once=True)

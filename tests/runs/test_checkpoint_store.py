@@ -1,10 +1,12 @@
 """Checkpoints on disk: whole or absent, and the right ones kept."""
 
 import errno
+import itertools
 import json
 import os
 import resource
 import shutil
+import time
 from pathlib import Path
 
 import jax
@@ -200,6 +202,14 @@ RATES = [(0, 0.1), (10, 0.9), (20, 0.9), (30, 0.2), (40, None), (50, 0.3), (60, 
 def test_the_latest_the_first_and_the_best_stay_and_of_equals_the_later(run_dir, keep, kept):
     save(run_dir, *RATES, keep=keep)
     assert checkpoint_steps(run_dir) == kept
+
+
+def test_a_clock_that_is_set_back_keeps_the_latest_by_their_steps(run_dir, monkeypatch):
+    now = itertools.count(time.time(), -3_600)
+    monkeypatch.setattr(time, "time", lambda: next(now))
+    save(run_dir, 1, (2, 0.9), 3, keep=2)
+    save(run_dir, 4, 5, 6, keep=2)
+    assert checkpoint_steps(run_dir) == [1, 2, 5, 6]
 
 
 def test_the_folder_of_old_checkpoints_is_kept_while_one_is_being_moved(run_dir):

@@ -7,6 +7,7 @@ with a report after every fourth: each is compared to the smoke run, which was n
 import errno
 import fcntl
 import functools
+import itertools
 import json
 import os
 import shutil
@@ -43,6 +44,7 @@ from jetbot_mjx.runs.checkpoint_store import (
 )
 from jetbot_mjx.runs.resumption import TRAINING, resume, to_trees
 from jetbot_mjx.runs.run_dir import write_run
+from jetbot_mjx.runs.run_finder import find_run, runs_table, scan_runs
 from jetbot_mjx.training import ppo_trainer, session
 from jetbot_mjx.training.preemption import StopRequest
 from jetbot_mjx.training.result import complete_message
@@ -230,6 +232,36 @@ def test_stopped_anywhere_and_continued_is_never_stopped(
     monkeypatch.undo()
     assert session.run(config, run_dir).finished
     same(run_dir)
+
+
+@pytest.fixture
+def clock_going_back(monkeypatch):
+    """The clock of the system is an hour earlier each time that somebody looks at it."""
+    now = itertools.count(time.time(), -3_600)
+    monkeypatch.setattr(time, "time", lambda: next(now))
+
+
+def test_a_clock_that_is_set_back_changes_nothing(
+    config, tmp_path, stop_after, same, clock_going_back
+):
+    run_dir = tmp_path / "run"
+    for count in (6, 99):
+        stop_after(count)
+        assert session.run(config, run_dir).finished == (count == 99)
+    same(run_dir)
+    history = metrics.read_history(run_dir / "metrics.jsonl")
+    times = [line.timestamp for line in history]
+    assert times == sorted(times, reverse=True)
+    for name in {name for line in history for name in line.metrics if name.startswith("time/")}:
+        values = [line.metrics[name] for line in history]
+        assert all(value is None or value >= 0 for value in values), name
+    wall = [line.metrics["time/wall_seconds"] for line in history]
+    assert wall == sorted(wall)
+    assert wall[-1] < 3_600
+    (listed,), damaged = scan_runs(tmp_path)
+    assert not damaged
+    assert (listed.env_steps, find_run("latest", tmp_path)) == (LAST, run_dir)
+    assert " 0 s" in runs_table([listed._replace(changed=times[0] + 86_400)])
 
 
 def test_a_state_between_two_reports_is_saved_with_what_was_summed_up(

@@ -3,8 +3,10 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -50,11 +52,10 @@ class Sent(GoalTask):
 TELLER = f"{gliding.LAZILY}; from helpers import distributed_process; distributed_process.main()"
 
 
-def start(arguments, *, interrupted=False, **variables):
+def start(arguments, *, sent="-", **variables):
     environment = {name: value for name, value in os.environ.items() if name not in VARIABLES}
-    flag = "interrupted" if interrupted else "-"
     return subprocess.Popen(
-        [sys.executable, "-c", TELLER, flag, *map(str, arguments)],
+        [sys.executable, "-c", TELLER, sent, *map(str, arguments)],
         env={**environment, "JAX_PLATFORMS": "cpu", **variables},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -98,7 +99,7 @@ def stopped(alone, unused_port):
     begun = [
         start(
             ["--config", SMOKE, "--distributed", *SETTINGS, "--run-dir", folder],
-            interrupted=index == 1,
+            sent="SIGTERM" if index == 1 else "-",
             JAX_COORDINATOR_ADDRESS=f"127.0.0.1:{port}",
             JAX_NUM_PROCESSES="2",
             JAX_PROCESS_ID=str(index),
@@ -185,6 +186,39 @@ def test_they_end_with_the_bits_of_one_process_on_two_devices(alone, finished):
         assert {k: v for k, v in ours.items() if not k.startswith("time")} == {
             k: v for k, v in theirs.items() if not k.startswith("time")
         }
+
+
+@pytest.mark.slow
+def test_one_that_is_killed_ends_the_other_with_one_line_and_costs_no_bit(
+    alone, unused_port, tmp_path
+):
+    run_dir = tmp_path / "run"
+
+    def together(signals):
+        port = unused_port()
+        begun = [
+            start(
+                ["--config", SMOKE, "--distributed", *SETTINGS, "--run-dir", run_dir],
+                sent=sent,
+                JAX_COORDINATOR_ADDRESS=f"127.0.0.1:{port}",
+                JAX_NUM_PROCESSES="2",
+                JAX_PROCESS_ID=str(index),
+            )
+            for index, sent in enumerate(signals)
+        ]
+        second, began = Ended(begun[1]), time.monotonic()
+        return Ended(begun[0]), second, time.monotonic() - began
+
+    first, second, seconds = together(["-", "SIGKILL"])
+    assert (first.code, second.code) == (2, -signal.SIGKILL), first.err
+    assert seconds < 30
+    (line,) = first.complained.splitlines()
+    assert line.startswith("error: the device failed: ")
+    assert f"`jetbot-mjx train --resume {run_dir}` continues it from there" in line
+    first, _, _ = together(["-", "-"])
+    assert first.code == 0, first.err
+    sums = [re.search(r"sha256 (\w+)", one.said)[1] for one in (first, alone[0])]
+    assert sums[0] == sums[1]
 
 
 # One process by itself: nothing to wait for, and mistakes that cost one line.
