@@ -20,6 +20,7 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "error: jetbot_mjx needs Python 3.11 or later, not %d.%d; say make PYTHON=python3.11" % sys.version_info[:2])'
 	$(PYTHON) -m venv $(VENV)
+	@echo "installing into $(VENV): pip takes a few minutes and prints nothing unless something is wrong"
 	$(BIN)/python -m pip install --quiet --constraint $(CONSTRAINTS) --editable '.[dev]'
 	@touch $@
 
@@ -39,6 +40,8 @@ train: setup
 	$(BIN)/jetbot-mjx evaluate $(RUN)
 	-$(BIN)/jetbot-mjx render $(RUN) --episodes 8
 	@echo "everything is in $(RUN); to use the commands in this shell: source $(BIN)/activate"
+	@echo "then: jetbot-mjx runs --open latest   the report"
+	@echo "      jetbot-mjx play latest          the robot, live in the browser"
 
 test: setup
 	$(BIN)/python -m pytest -m 'not slow' --numprocesses logical --maxprocesses 8 --dist loadfile \
