@@ -251,7 +251,10 @@ def explain_missing(path: Path) -> str:
     return f"{what}; {suggest_run(path)}"
 
 
-def suggest_run(path: Path, what: str = "a run folder or a checkpoint in it") -> str:
+_RUN = "a run folder, a checkpoint in it, or a name that `jetbot-mjx runs` lists"
+
+
+def suggest_run(path: Path, what: str = _RUN) -> str:
     """Return a remedy for a path at which there is no run.
 
     Args:

@@ -212,7 +212,10 @@ def test_evaluate_refuses_an_invalid_success_rate(refused, value, said):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda path: None, "no such folder; give a run folder or a checkpoint in it"),
+        (
+            lambda path: None,
+            "no such folder; give a run folder, a checkpoint in it, or a name that",
+        ),
         (lambda path: path.write_text("x"), "a file; give a run folder"),
         (lambda path: path.mkdir(), "it holds neither checkpoints/ nor policy/; give a run folder"),
         (lambda path: (path / "src").mkdir(parents=True), "neither checkpoints/ nor policy/"),
@@ -395,7 +398,8 @@ def test_train_names_its_run_folder_after_the_configuration(asked):
         ),
         (
             ["evaluate", "."],
-            "it holds neither checkpoints/ nor policy/; give a run folder or a checkpoint in it\n",
+            "it holds neither checkpoints/ nor policy/; give a run folder, a checkpoint in it, "
+            "or a name that `jetbot-mjx runs` lists\n",
         ),
         (["render", ".", "--episodes", "0"], "0 is too small: give at least 1"),
     ],

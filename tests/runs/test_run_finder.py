@@ -46,7 +46,7 @@ def test_a_missing_run_is_refused_with_the_likely_name(runs):
     with pytest.raises(CheckpointError, match=r"did you mean newer\?") as caught:
         find_checkpoint("newr")
     assert isinstance(caught.value, FileNotFoundError)
-    with pytest.raises(CheckpointError, match="give a run folder or a checkpoint in it"):
+    with pytest.raises(CheckpointError, match="give a run folder, a checkpoint in it, or a name"):
         find_checkpoint("something else")
     names = (
         "there are best, best_egocentric, camera_real, jetbot_camera, jetbot_egocentric,"
