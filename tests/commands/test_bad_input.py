@@ -243,18 +243,18 @@ def test_too_little_memory_costs_one_line(capfd):
 
 
 @pytest.mark.parametrize(
-    ("method", "use"),
+    ("owner", "method", "use"),
     [
-        ("exists", lambda: stored_config(Path("run"))),
-        ("iterdir", lambda: stored_config(Path(__file__).parent)),
-        ("is_dir", lambda: evaluate.main(["run"])),
+        (Path, "exists", lambda: stored_config(Path("run"))),
+        (os, "listdir", lambda: stored_config(Path(__file__).parent)),
+        (Path, "is_dir", lambda: evaluate.main(["run"])),
     ],
 )
-def test_a_forbidden_path_costs_one_line(monkeypatch, method, use):
+def test_a_forbidden_path_costs_one_line(monkeypatch, owner, method, use):
     def deny(path, **kwargs):
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, method, deny)
+    monkeypatch.setattr(owner, method, deny)
     # Denied its folder, JAX would do without one in all later tests.
     monkeypatch.setattr(devices, "use_compilation_cache", lambda: None)
     with pytest.raises(UserError, match="Permission denied"):
