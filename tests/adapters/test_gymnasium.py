@@ -315,6 +315,7 @@ def test_gymnasium_finds_the_environment_in_a_fresh_process(fresh_process):
     assert fresh_process.stdout.startswith("JetBot-v0\n"), fresh_process.stderr[-2000:]
 
 
+@pytest.mark.slow
 def test_an_environment_that_is_not_closed_prints_nothing_at_exit(needs_opengl, fresh_process):
     told = fresh_process
     assert (told.returncode, told.stderr) == (0, "")

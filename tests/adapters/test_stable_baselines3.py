@@ -79,6 +79,7 @@ def test_its_checker_passes():
     check_env(JetBotGymEnv())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("steps", "shorter"),
     [(1024, {"n_steps": 512}), pytest.param(20_000, {}, marks=pytest.mark.slow)],

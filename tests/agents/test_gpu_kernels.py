@@ -111,6 +111,7 @@ def test_actions_are_those_of_float64(name, environments, model):
         assert_are_actions([x[i] for x in results], SHAPES[name], expected, 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schedule", ["NONE", "LINEAR", "ADAPTIVE_KL"])
 @pytest.mark.parametrize("name", ["swish", "relu", "elu"])
 def test_a_step_of_adam_is_that_of_a_cpu(name, schedule, model):
@@ -165,6 +166,7 @@ def small_adam():
     launched_by(launch_gpu, signatures.ADAM, rule, arrays)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("launch", [small_gradient, small_actions, small_adam])
 def test_without_any_one_of_their_barriers_threads_race(launch, model, monkeypatch):
     model(processors=1)

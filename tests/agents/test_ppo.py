@@ -637,6 +637,7 @@ def several(smoke, tmp_path_factory):
         return config, session.run(config, tmp_path_factory.mktemp("seeds") / "run")
 
 
+@pytest.mark.slow
 def test_each_of_several_seeds_is_trained_as_if_alone(several, ours):
     config, result = several
     _, one = ours(Gliding, "NONE", 1.0)

@@ -75,7 +75,7 @@ CASES = {
 }
 
 
-# Their steps are among those of the quick cases, and so are several parts and policies.
+# The quick ones are two policies of drawn robots, and a single environment.
 FURTHER = (
     "jetbot",
     "egocentric",
@@ -83,6 +83,8 @@ FURTHER = (
     "more than a part",
     "parts of odd sizes",
     "not normalised",
+    "several unrolls",
+    "normal",
 )
 
 

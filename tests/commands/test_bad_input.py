@@ -210,6 +210,7 @@ def test_a_stray_folder_among_the_checkpoints_does_not_matter(refused, damaged):
     refused(evaluate, damaged.parents[1], "--checkpoint", "123")
 
 
+@pytest.mark.slow
 def test_missing_parameters_cost_one_line(damaged):
     shutil.rmtree(damaged / "policy" / "d")
     process = subprocess.run(

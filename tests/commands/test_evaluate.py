@@ -14,6 +14,7 @@ from PIL import Image
 
 from helpers import gliding
 from helpers.command_modules import evaluate
+from helpers.further import slow_fixture
 from helpers.unpainted import unpainted
 from jetbot_mjx import cli, evaluation
 from jetbot_mjx.errors import UserError
@@ -367,7 +368,7 @@ def test_a_long_list_of_failures_is_cut_on_the_pages_alone(hopeless, tmp_path, m
 # Several policies.
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def several(smoke_run, still, tmp_path_factory):
     """A folder of two seeds, the second less trained, and the still run, compared."""
     folder = tmp_path_factory.mktemp("several")

@@ -152,6 +152,7 @@ def test_a_configuration_object_gets_a_folder_of_its_own(tmp_path, monkeypatch):
     assert [name.partition("-")[0] for _, name in folders] == ["run", "smoke"]
 
 
+@pytest.mark.slow
 def test_a_run_is_evaluated_and_several_are_compared(trained, tmp_path, blank_figures, capfd):
     with gliding.everywhere():
         report = evaluate(trained.run_dir, episodes=4, output=tmp_path / "one")
@@ -318,6 +319,7 @@ jax.eval_shape(env.reset, jax.random.key(0))
 """
 
 
+@pytest.mark.slow
 def test_an_environment_refuses_another_shape_in_one_line():
     # In a process of its own: in that of the tests, jaxtyping would see it first.
     several = "got 3 of them, and an environment is of one robot: batch it, as in jax.vmap(env."

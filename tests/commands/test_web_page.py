@@ -132,6 +132,7 @@ def functions_once(monkeypatch):
     monkeypatch.setattr(web_page, "web_functions", once)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("functions_once")
 def test_a_page_of_a_run_is_small_and_has_its_policies(here, capfd):
     # An early checkpoint, one in between, and the last.

@@ -12,6 +12,7 @@ from brax.training.acme import running_statistics
 
 import jetbot_mjx
 from helpers import node
+from helpers.further import slow_fixture
 from helpers.source_tree import ROOT
 from helpers.web_pages import shipped
 from jetbot_mjx.agents.fused import arrays, launch
@@ -59,7 +60,7 @@ return {{ first, taken, second: rows, before, after: copies(), updates,
 """
 
 
-@pytest.fixture(scope="module")
+@slow_fixture(scope="module")
 def page():
     return shipped("jetbot_egocentric")
 

@@ -178,6 +178,7 @@ def test_relative_costs_are_differences_of_mjx_costs(xml):
     np.testing.assert_allclose(ours, theirs - theirs[0], rtol=1e-5, atol=rounding)
 
 
+@pytest.mark.slow
 def test_a_search_ends_where_mjxs_does_when_the_gain_is_large():
     model, data, context = problem()
     theirs = search(library[0], model, data, context)

@@ -26,6 +26,7 @@ print(trimesh.creation.box().volume)
 """
 
 
+@pytest.mark.slow
 def test_trimesh_is_loaded_when_a_mesh_needs_it_and_prints_nothing():
     done = subprocess.run([sys.executable, "-c", MESH], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "1.0\n"), done.stderr[-2000:]

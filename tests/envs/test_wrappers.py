@@ -240,6 +240,7 @@ def test_after_the_end_obs_tells_of_the_new_goal_and_final_obs_of_the_old(driven
     assert np.all(final_obs[ended][:, 0] > 1e-3)  # where it had driven to
 
 
+@pytest.mark.slow
 def test_each_environment_can_have_a_physics_model_of_its_own():
     env = make_env(parse_config({}))
     slopes = jnp.array([0.5, 1.0])

@@ -143,6 +143,7 @@ def test_a_robot_is_not_compared_with_an_environment(folder):
         compare_runs([folder / "one", "pretrained:jetbot_egocentric"])
 
 
+@pytest.mark.slow
 def test_a_target_needs_successes(tmp_path):
     training.run(point_mass.config(), tmp_path / "silent")
     with pytest.raises(UserError, match=r"--min-success 0\.5: the environment has no metric"):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from helpers.further import slow_fixture
 from helpers.gliding import Gliding
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.build import make_env
@@ -102,7 +103,7 @@ def test_no_key_of_a_controller_is_one_that_a_reset_draws_from():
     assert not told & drawn
 
 
-@pytest.fixture(scope="module", params=["isaac", "real"])
+@slow_fixture(scope="module", params=["isaac", "real"])
 def driven(request):
     env = make_env(parse_config({"robot": {"preset": request.param}}))
     controllers = [make(env) for make in BASELINES.values()]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-LIMIT = 75
+LIMIT = 40
 """Processor time of `make test` in a clean clone, at most [min]; CONTRIBUTING.md promises it."""
 
 SHOWN = 25

@@ -119,6 +119,7 @@ def test_it_drives_as_xla_does(driven):
     assert np.ptp(np.asarray(ours.qpos[:, 0])) > 0.5
 
 
+@pytest.mark.slow
 @needs_it
 def test_a_robots_bits_do_not_depend_on_those_beside_it(driven):
     _, drive_it = driven

@@ -62,6 +62,7 @@ def test_a_kernel_does_what_the_function_does(name, lanes):
     np.testing.assert_allclose(ours, theirs, rtol=2e-5, atol=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCANS)
 def test_arrays_hold_the_numbers_of_each_robot(name, lanes):
     function, x = SCANS[name], robots(2 * LANES + 3)

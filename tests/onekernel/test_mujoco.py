@@ -66,6 +66,7 @@ def compared(model, *, with_mjx=False, n_substeps=1):
     return difference(found, wanted), with_mjx and difference(found, by_mjx(step, states, ctrl))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("integrator", "n_substeps"), [("Euler", 3), ("RK4", 1)])
 def test_a_cart_moves_as_in_c(integrator, n_substeps):
     assert compared(model_of(CART_POLE, integrator), n_substeps=n_substeps)[0] < 1e-6

@@ -111,6 +111,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param("moves", marks=pytest.mark.slow), "blocks"])
 def test_all_kinds_of_operations_have_jaxs_gradient(name, monkeypatch):
     if name == "blocks":

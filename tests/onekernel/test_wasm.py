@@ -256,6 +256,7 @@ def test_a_result_may_take_the_place_of_its_argument(module):
     np.testing.assert_array_equal(in_place, result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [0, 1, 9])
 def test_an_image_is_made_of_every_item(count, module):
     table, _ = map_kernels.make(MAP_ITEMS)

@@ -174,10 +174,12 @@ def test_importing_all_modules_leaves_the_process_as_it_is(after_others, what):
     assert after_others["after"][what] == after_others["before"][what]
 
 
+@pytest.mark.slow
 def test_importing_all_modules_replaces_nothing_of_others(after_others):
     assert after_others["replaced"] == []
 
 
+@pytest.mark.slow
 def test_importing_all_modules_loads_others_whole(after_others):
     expected, found = after_others["loaded"], run([], MODULES)["loaded"]
     # A module of which a part was hidden while it was imported lacks names.

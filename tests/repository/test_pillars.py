@@ -58,6 +58,7 @@ def test_a_pillar_stops_the_robot_at_its_surface(drives, env):
     assert front == pytest.approx(0.5 - pillars_task.PILLAR_RADIUS, abs=0.003)
 
 
+@pytest.mark.slow
 def test_a_pillar_beside_the_way_leaves_the_robot_alone(drives):
     assert drives[0][2, -1, 0] > 1.1
     assert abs(drives[0][2, -1, 1]) < 1e-3

@@ -24,7 +24,7 @@ GYMNASIUM = {
 """Class of each example with its name in Gymnasium."""
 
 CLASSES = {"cartpole": "Cartpole"} | {name: first for name, (first, _) in GYMNASIUM.items()}
-QUICK = ("cartpole", "reacher")
+QUICK = ("cartpole",)
 INSTANCES, STEPS = 8, 40
 
 

@@ -107,6 +107,7 @@ np.save(sys.argv[3], np.asarray(load_policy(sys.argv[1])(obs)))
 """
 
 
+@pytest.mark.slow
 def test_a_fresh_process_gives_identical_actions(smoke_run, tmp_path):
     obs = np.asarray(jax.random.normal(jax.random.PRNGKey(5), (257, 7)))
     np.save(tmp_path / "obs.npy", obs)

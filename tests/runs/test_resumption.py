@@ -761,6 +761,7 @@ def test_settings_that_may_change_on_resume_are_applied_and_stored(run_copy, key
     assert checkpoint_steps(run_copy) == STEPS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("setting", "said"),
     [

@@ -34,6 +34,7 @@ def python(folder, *arguments):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [False, True])
 @pytest.mark.parametrize("command", ["train", "evaluate"])
 def test_a_command_that_still_loads_leaves_quietly(command, lost, tmp_path):
@@ -139,6 +140,7 @@ cli.run_command(command, at_once=True)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "error",
     ["ValueError: wrong", "SystemExit: wrong"],

@@ -158,6 +158,7 @@ def test_two_devices_train(config_file):
     assert load_checkpoint(run_dir).env_steps == STEP
 
 
+@pytest.mark.slow
 def test_a_task_whose_policy_sees_passes_its_checks(config_file, capsys):
     arguments = ["--set", "task.observation=camera", "--set", "camera.samples=2"]
     assert check_env.main(["--config", str(config_file), *arguments]) == 0

@@ -137,6 +137,7 @@ def test_while_importing_the_signal_ends_the_process_and_nothing_is_written(tmp_
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_before_there_is_a_folder_the_signal_ends_the_process(tmp_path):
     with training(tmp_path / "run", f"dwell(setup.envs, 'make_env', {LONG})") as process:
         assert stop(process, "make_env") == -signal.SIGTERM

@@ -122,6 +122,7 @@ def test_a_setting_may_be_null_in_the_configuration_or_among_the_choices(tmp_pat
     assert len(two.confirm(2, 2, 4)) == 3
 
 
+@pytest.mark.slow
 def test_choices_may_be_lists(tmp_path):
     name = "ppo.network.policy_hidden_layer_sizes"
     config = parse_config({"ppo": {"network": {"policy_hidden_layer_sizes": [16]}}})
@@ -292,6 +293,7 @@ def test_any_folder_can_hold_a_study(tmp_path, monkeypatch, name):
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
+@pytest.mark.slow
 def test_without_final_trainings_the_best_trial_is_the_best(tmp_path):
     one = search.Search(CONFIG, SPACE[:1], tmp_path / "s")
     one.run(8, 4)
@@ -348,6 +350,7 @@ def test_no_connection_to_the_study_stays_open(tmp_path):
     assert str(tmp_path / "s" / "study.db") not in opened
 
 
+@pytest.mark.slow
 def test_every_phase_is_a_stage_that_a_command_shows(tmp_path):
     with noted_stages() as shown:
         one = search.Search(CONFIG, SPACE, tmp_path / "s")

@@ -12,6 +12,7 @@ from mujoco.rendering.classic import gl_context
 from numpy.lib.stride_tricks import sliding_window_view
 
 from helpers.camera_scenes import Scenes, make_model, turned
+from helpers.further import slow_fixture
 from jetbot_mjx.config import CameraConfig, Config
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.camera.render import Camera
@@ -148,7 +149,7 @@ def _even(ids):
 SCENES = {"several": (several, 4, 1), "stretched": (stretched, 3, 2), "planes": (two_planes, 3, 3)}
 
 
-@pytest.fixture(scope="module", params=list(SCENES))
+@slow_fixture(scope="module", params=list(SCENES))
 def beside(request, opengl):
     build, count, seed = SCENES[request.param]
     return Beside(build(), count, seed)
