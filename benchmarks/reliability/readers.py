@@ -298,7 +298,7 @@ def _checkpoint_samples() -> list[bytes]:
 
 
 def _files_of(checkpoint: Path) -> list[Path]:
-    """Return the files that a reader needs: Orbax has others beside them."""
+    """Return the files that a reader needs: there are others beside them, for Orbax."""
     found = sorted((checkpoint / "policy").rglob("*"))
     return [x for x in found if x.is_file() and "ocdbt" in str(x) or x.parent.name == "d"]
 

@@ -396,7 +396,7 @@ def _unfinished(run_dir: Path) -> set[str]:
     folder = run_dir / FOLDER
     if not folder.is_dir():
         return set()
-    return {path.name for path in folder.iterdir() if "orbax-checkpoint-tmp" in path.name}
+    return {path.name for path in folder.iterdir() if path.name.endswith(".unfinished")}
 
 
 def table(kills: Sequence[Kill]) -> str:

@@ -5,7 +5,6 @@ from .checkpoint import about_policy as about_policy
 from .checkpoint import find_checkpoint as find_checkpoint
 from .checkpoint import load_checkpoint as load_checkpoint
 from .checkpoint import load_policy as load_policy
-from .checkpoint_manager import open_manager as open_manager
 from .checkpoint_store import CheckpointStore as CheckpointStore
 from .checkpoint_store import checkpoint_path as checkpoint_path
 from .checkpoint_store import checkpoint_steps as checkpoint_steps

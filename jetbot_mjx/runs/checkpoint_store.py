@@ -6,13 +6,12 @@ checkpoint, and a damaged checkpoint must never be loaded as if it were a good o
 
 Protocol:
 
-1. Write: Orbax writes each checkpoint under a temporary name, has the disk hold all of it, and
+1. Write: a thread writes each checkpoint under a temporary name, has the disk hold all of it, and
    renames it to `checkpoints/<env_steps>/`. A process that dies leaves at most a temporary folder,
    which the next one removes, and so does a loss of power.
 2. Digests: the folder holds one or more trees of arrays and `about`, a JSON object. `about` also
-   holds the SHA-256 of each tree and of itself. Of a joined tree, Orbax writes the bytes of all
-   arrays as one, and `about` holds their names, dtypes and shapes: an array by itself takes Orbax a
-   millisecond, during which the training has a core less.
+   holds the SHA-256 of each tree and of itself. Of a joined tree, the bytes of all arrays are
+   written as one, which is faster, and `about` holds their names, dtypes and shapes.
 3. Read: a reader recomputes the digests and compares the folder's name with the stored
    `env_steps`. If anything differs, it raises a `CheckpointError` with the reason.
 4. Damage: a damaged checkpoint is never repaired or deleted. `resume` skips it, continues from the
@@ -20,29 +19,26 @@ Protocol:
    its own under their names.
 5. Drive: if a drive does not answer, as one on a network may for a while, that says nothing of what
    it holds. Then an `UnreadableError` ends the training, and no checkpoint is skipped.
-6. Delete: a checkpoint that is removed is first moved to `.deleted`, so that a half-deleted one
-   never has a valid name.
+6. Delete: a checkpoint that is removed is renamed first, so that a half-deleted one never has a
+   valid name.
 
 Arguments for this protocol: arrays are stored by name, as NumPy arrays from the host, so that the
 files depend neither on a Python class nor on the number of devices. The digests cover names,
 dtypes, shapes and bytes, so they reveal every change of the content.
 """
 
-import atexit
 import contextlib
 import hashlib
 import itertools
 import json
-import logging
 import math
 import os
 import re
 import shutil
 import stat
-import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -57,11 +53,9 @@ from jetbot_mjx.errors import (
     os_errors,
     shown,
 )
-from jetbot_mjx.runs.durable import make_folders, move
+from jetbot_mjx.runs.checkpoint_writer import write_arrays
+from jetbot_mjx.runs.durable import make_folders, move, sync_tree
 from jetbot_mjx.runs.run_dir import JsonObject, read_text, remove
-
-if TYPE_CHECKING:
-    import orbax.checkpoint as ocp
 
 FOLDER = "checkpoints"
 """Name of the folder of checkpoints in a run folder."""
@@ -73,9 +67,8 @@ _BYTES = "bytes"
 _SCORE = "score"
 _STEP_DIGITS = 12
 _SPARE_BYTES = 1_000_000
-_DELETED = ".deleted"
-
-_CLOSED = "Event loop is closed"
+_HIDDEN = ".{}.unfinished"
+"""Name of a checkpoint that is not complete yet, or no longer."""
 
 _UNSUSPECTED_BYTES = 1_000_000_000
 _MOST_COMPRESSED = 1_000
@@ -127,12 +120,13 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
           UnreadableError: the drive does not answer.
         """
         self._scores = {step: stored_score(run_dir, step) for step in checkpoint_steps(run_dir)}
-        self._keep = keep
-        self._manager: ocp.CheckpointManager | None = None
-        self._log, self._failed = contextlib.ExitStack(), False
-        self._folder = (run_dir / FOLDER).absolute()
+        self._run_dir, self._keep = run_dir.absolute(), keep
+        self._folder = self._run_dir / FOLDER
+        self._thread = ThreadPoolExecutor(1, "checkpoints")
+        self._write: Future[None] | None = None
         with self._writing():
-            self._clear_deleted()
+            for path in self._folder.glob(_HIDDEN.format("*")):
+                remove(path)
             make_folders(self._folder)
 
     def save(
@@ -156,56 +150,71 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
         Raises:
           CheckpointError: this checkpoint, or the one before, could not be written.
         """
-        # Brax's counters stay JAX arrays even on the host, so convert every leaf to NumPy.
-        flat = {
-            name: {key: np.asarray(x) for key, x in flatten(tree).items()}
-            for name, tree in trees.items()
-        }
         with self._writing():
-            self._clear_deleted()
+            self._wait()
+            # Copy the arrays, which may change while they are written.
+            flat = {
+                name: {key: np.array(x) for key, x in flatten(tree).items()}
+                for name, tree in trees.items()
+            }
             self._check_space(sum(x.nbytes for tree in flat.values() for x in tree.values()))
-        # Add the digests by which a reader recognises damage.
-        digests = {name: digest(tree) for name, tree in flat.items()}
-        about = {**about, "env_steps": env_steps, _SCORE: score, _DIGESTS: digests}
-        about[_JOINED] = {name: _table(flat[name]) for name in joined}
-        about[_DIGESTS] = {**digests, _ABOUT: _digest_json(about)}
-        arrays = {name: _join(x) if name in joined else x for name, x in flat.items()}
-        # Hand over to Orbax, which writes in the background.
-        self._scores[env_steps] = -math.inf if score is None else score
-        with self._writing():
-            # Orbax is imported with the first checkpoint, while a program compiles.
-            from jetbot_mjx.runs.checkpoint_manager import open_manager, start_save
-
-            if self._manager is None:
-                self._log.enter_context(_without_log())
-                self._manager = open_manager(
-                    self._folder, self._keep, self._scores, _STEP_DIGITS, _DELETED
-                )
-            if not start_save(self._manager, env_steps, arrays, {_ABOUT: about}):
+            if env_steps <= max(self._scores, default=-1):
                 raise ValueError(f"there is one after {env_steps} steps or more")
+        self._scores[env_steps] = -math.inf if score is None else score
+        about = {**about, "env_steps": env_steps, _SCORE: score}
+        path = checkpoint_path(self._run_dir, env_steps)
+        self._write = self._thread.submit(self._write_one, path, flat, about, joined)
+
+    def _write_one(
+        self,
+        path: Path,
+        trees: Mapping[str, Mapping[str, np.ndarray]],
+        about: JsonObject,
+        joined: Collection[str],
+    ) -> None:
+        """Write a checkpoint, and delete those that it replaces."""
+        # Add the digests by which a reader recognises damage.
+        digests = {name: digest(tree) for name, tree in trees.items()}
+        about = {
+            **about,
+            _DIGESTS: digests,
+            _JOINED: {name: _table(trees[name]) for name in joined},
+        }
+        about[_DIGESTS] = {**digests, _ABOUT: _digest_json(about)}
+        # Write under a temporary name, and rename what the disk holds.
+        unfinished = path.with_name(_HIDDEN.format(path.name))
+        try:
+            (unfinished / _ABOUT).mkdir(parents=True)
+            (unfinished / _ABOUT / "metadata").write_text(json.dumps(about))
+            for name, tree in trees.items():
+                write_arrays(unfinished / name, _join(tree) if name in joined else tree)
+            sync_tree(unfinished)
+            move(unfinished, path)
+        finally:
+            remove(unfinished)
+        self._delete_superseded()
+
+    def _delete_superseded(self) -> None:
+        """Delete all but the latest, the first and the best, which of equals is the later one."""
+        steps = checkpoint_steps(self._run_dir)
+        best = max(steps, key=lambda step: (self._scores.get(step, -math.inf), step))
+        for step in steps[1 : -self._keep]:
+            if step != best:
+                path = checkpoint_path(self._run_dir, step)
+                hidden = path.with_name(_HIDDEN.format(path.name))
+                move(path, hidden)
+                remove(hidden)
+
+    def _wait(self) -> None:
+        """Wait for the last write, and raise its error."""
+        write, self._write = self._write, None
+        if write is not None:
+            write.result()
 
     def __exit__(self, *exception: object) -> None:
         """Wait until all checkpoints are on disk, and close the store."""
-        try:
-            with self._writing():
-                if self._manager is not None:
-                    self._manager.close()
-                remove(self._folder / _DELETED)
-        finally:
-            if self._failed:
-                # Threads of Orbax may still report what the caller knows.
-                atexit.register(self._log.close)
-            else:
-                self._log.close()
-
-    def _clear_deleted(self) -> None:
-        deleted = self._folder / _DELETED
-        if not deleted.is_dir():
-            # Orbax would fail to move a checkpoint into it.
-            remove(deleted)
-        # Keep the folder itself, because Orbax may be about to move the next checkpoint into it.
-        for path in deleted.glob("*"):
-            remove(path)
+        with self._thread, self._writing():
+            self._wait()
 
     def _check_space(self, size: int) -> None:
         """Raise a `CheckpointError` if the disk has no room for a checkpoint of this size [bytes].
@@ -227,41 +236,10 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
         except UserError:
             raise
         except Exception as error:
-            self._failed = True
             raise CheckpointError(
                 f"{self._folder}: a checkpoint could not be written: {_reason(error)}; the earlier"
                 " ones are unchanged"
             ) from error
-
-
-@contextlib.contextmanager
-def _without_log() -> Iterator[None]:
-    """Keep Orbax from logging inside the context; what others log remains.
-
-    Orbax logs every step of its work at INFO, and recommendations at WARNING. At ERROR it logs
-    tracebacks from each of its threads for errors that it raises as well. After the first error
-    TensorStore still reports the others, to an event loop that Orbax has closed.
-    """
-    orbax, root = logging.getLogger("absl"), logging.getLogger()
-    none, hook = logging.NullHandler(), sys.unraisablehook
-
-    def is_shown(record: logging.LogRecord) -> bool:
-        return "orbax" not in Path(record.pathname).parts
-
-    def report(lost: "sys.UnraisableHookArgs") -> None:
-        if str(lost.exc_value) != _CLOSED:
-            hook(lost)
-
-    sys.unraisablehook = report
-    orbax.addFilter(is_shown)
-    # As long as there is no handler, its logger adds one that writes to standard error.
-    root.addHandler(none)
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
-        root.removeHandler(none)
-        orbax.removeFilter(is_shown)
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:
@@ -449,7 +427,7 @@ def _digest_json(values: JsonObject) -> str:
 
 
 def _read_arrays(folder: Path, wanted: Mapping[str, _Typed]) -> dict[str, np.ndarray]:
-    """Read the arrays that Orbax wrote, one after the other, and raise at the first wrong one.
+    """Read arrays one after the other, and raise at the first wrong one.
 
     Orbax itself reads in threads. If one of them fails, the others print tracebacks that the
     caller cannot catch.

@@ -362,7 +362,7 @@ def versions() -> JsonObject:
     import jax
 
     devices = jax.devices()
-    packages = ("jetbot_mjx", *LIBRARIES, "orbax-checkpoint")
+    packages = ("jetbot_mjx", *LIBRARIES)
     return {
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",

@@ -14,10 +14,9 @@ and Ctrl-C may wait for a compiler or print a traceback during imports:
     set_environment        OPENBLAS_NUM_THREADS=1, so that NumPy starts no threads;
                            PYDANTIC_DISABLE_PLUGINS, so that Pydantic looks for none
                            (NumPy 2.4, Pydantic 2.13)
-    install_lazy_imports   imports parts of Flax (180 ms), JAX (Pallas, 60 ms), Orbax (30 ms), Brax,
-                           MJX, MuJoCo and tensorboardX (PyTorch, seconds) at their first use, or
-                           not at all (JAX 0.10, 0.12; Flax 0.12; Orbax 0.12; MuJoCo 3.17;
-                           tensorboardX 2.6)
+    install_lazy_imports   imports parts of Flax (180 ms), JAX (Pallas, 60 ms), Brax, MJX, MuJoCo
+                           and tensorboardX (PyTorch, seconds) at their first use, or not at all
+                           (JAX 0.10, 0.12; Flax 0.12; MuJoCo 3.17; tensorboardX 2.6)
     exit_at_once           ends the process without Python's clean-up: 1 s on a GPU (JAX 0.10)
     wake_driver            opens NVIDIA's driver in a thread while JAX is imported: 190 ms
                            (CUDA 13)

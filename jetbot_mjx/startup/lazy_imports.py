@@ -3,10 +3,10 @@
 MuJoCo loads GLFW before a window is requested. MJX loads trimesh and SciPy's geometry for meshes,
 which no robot here has. Brax loads JAXopt for an engine that is not used here, and tensorboardX
 loads PyTorch and a logging service, neither of which is used. JAX loads Pallas. Flax loads its
-networks and Orbax its second interface, although a training that finds its programs compiled needs
-neither. On a slow machine these imports take more than two seconds at every start of a command. A
-training also needs no OpenGL, so that a command must be able to import MuJoCo even if the backend
-that `MUJOCO_GL` names is unavailable.
+networks, although a training that finds its programs compiled needs none. On a slow machine
+these imports take more than two seconds at every start of a command. A training also needs no
+OpenGL, so that a command must be able to import MuJoCo even if the backend that `MUJOCO_GL` names
+is unavailable.
 """
 
 import contextlib
@@ -91,7 +91,6 @@ def _mjx() -> Iterator[None]:
 
 _COMET = types.ModuleType("tensorboardX.comet_utils")
 _COMET.CometLogger = None  # pyright: ignore[reportAttributeAccessIssue]
-_ORBAX_V1 = "orbax.checkpoint.experimental.v1"
 _AROUND: Mapping[str, _Around] = {
     "brax.generalized.constraint": lambda: standing_in("jaxopt", LazyModule("jaxopt")),
     "brax.io.image": lambda: standing_in("PIL.Image", LazyModule("PIL.Image")),
@@ -104,7 +103,6 @@ _AROUND: Mapping[str, _Around] = {
     "mujoco.rendering.classic.gl_context": lambda: contextlib.suppress(
         ImportError, AttributeError, OSError, RuntimeError
     ),
-    "orbax.checkpoint": lambda: standing_in(_ORBAX_V1, LazyModule(_ORBAX_V1)),
     # Where PyTorch is installed, tensorboardX would load it to draw network graphs.
     "tensorboardX": lambda: standing_in("torch", None),
     # Stand in for a logging service of tensorboardX's own writer, which is not used.

@@ -75,9 +75,6 @@ def run(
     keep = programs is not None
     if programs is None:
         programs = envs.open_program_cache(config, keep=False)
-    if programs.loads:
-        # Import what writes checkpoints meanwhile; if not, there is time while programs compile.
-        from jetbot_mjx.runs import open_manager  # noqa: F401
     # Refuse what cannot be trained before anything is built.
     if jax.process_count() > 1:
         distributed.check_processes(config)

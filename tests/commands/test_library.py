@@ -361,7 +361,6 @@ def state():
         "figures": plt.get_fignums(),
     }
 
-import orbax.checkpoint
 from helpers import gliding, unpainted
 from jetbot_mjx import evaluate, train
 

@@ -51,8 +51,8 @@ BROKEN = {
 }
 
 BROKEN_TOO = {
-    "the content of a checkpoint": ("run", "checkpoint_manager.sync_tree = lambda folder: None"),
-    "the name of a checkpoint": ("run", "checkpoint_manager.sync = lambda folder: None"),
+    "the content of a checkpoint": ("run", "checkpoint_store.sync_tree = lambda folder: None"),
+    "the name of a checkpoint": ("run", "checkpoint_store.move = os.replace"),
     "a line of metrics": ("run", "metrics.os.fsync = lambda descriptor: None"),
     "the end of a journal": ("study", "search._SyncedConnection = sqlite3.Connection"),
 }
@@ -76,9 +76,10 @@ def test_a_missing_sync_of_a_training_is_found_out(tmp_path, name):
 def lost_without_a_sync(folder, scenario, change):
     program = folder / "program.py"
     program.write_text(
+        "import os\n"
         "import sqlite3\n"
         "from benchmarks.reliability import power_loss\n"
-        "from jetbot_mjx.runs import checkpoint_manager, durable, metrics, run_dir\n"
+        "from jetbot_mjx.runs import checkpoint_store, durable, metrics, run_dir\n"
         "from jetbot_mjx.tuning import search\n"
         f"{change}\n"
         "power_loss.main()\n"

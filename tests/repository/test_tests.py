@@ -63,7 +63,7 @@ TOGETHER = {
     "onekernel/test_program_cache": "envs.program_key",
     "onekernel/test_ptx_backend": "onekernel.gpu",
     "onekernel/test_scalar_ir": "onekernel.lower.indexing",
-    "runs/test_checkpoint_store": "runs.checkpoint_manager",
+    "runs/test_checkpoint_store": "runs.checkpoint_writer",
     "runs/test_task_code": "training.composition",
     "startup/test_interrupts": "interrupts",
     "startup/test_switch": "startup.process",

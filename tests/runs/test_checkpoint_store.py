@@ -6,6 +6,7 @@ import json
 import os
 import resource
 import shutil
+import threading
 import time
 from pathlib import Path
 
@@ -82,8 +83,9 @@ def test_a_checkpoint_is_read_back_unchanged(run_dir, joined):
 def test_arrays_changed_while_they_are_saved_are_saved_unchanged(run_dir):
     tree = {"weights": np.zeros(100_000)}
     with CheckpointStore(run_dir, keep=50) as store:
-        store.save(1, {"tree": tree}, {}, None)
-        store.save(2, {"tree": {"weights": np.ones(100_000)}}, {}, None)
+        for step in (1, 2):
+            store.save(step, {"tree": tree}, {}, None)
+            tree["weights"] += 1
     assert read(run_dir, 1, tree)["weights"].max() == 0
     assert read(run_dir, 2, tree)["weights"].min() == 1
 
@@ -167,7 +169,7 @@ def test_only_what_carries_the_name_of_a_checkpoint_is_one(run_dir):
     assert checkpoint_steps(run_dir) == []
     save(run_dir, 5, 1_000_000_000_000_000)
     folder = run_dir / FOLDER
-    for name in ("99", "5", "²", "000000000006.orbax-checkpoint-tmp", "more"):
+    for name in ("99", "5", "²", ".000000000006.unfinished", "more"):
         (folder / name).mkdir()
     (folder / "notes.txt").write_text("not a checkpoint")
     assert checkpoint_steps(run_dir) == [5, 1_000_000_000_000_000]
@@ -177,17 +179,17 @@ def test_only_what_carries_the_name_of_a_checkpoint_is_one(run_dir):
 
 def test_unfinished_checkpoints_of_an_earlier_process_are_deleted(run_dir):
     save(run_dir, 1)
-    left = run_dir / FOLDER / "000000000002.orbax-checkpoint-tmp"
-    (left / "tree.orbax-checkpoint-tmp").mkdir(parents=True)
+    left = run_dir / FOLDER / ".000000000002.unfinished"
+    (left / "tree").mkdir(parents=True)
     save(run_dir, 3)
     assert not left.exists()
     assert checkpoint_steps(run_dir) == [1, 3]
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
-def test_a_pipe_in_the_place_of_deleted_checkpoints_holds_nothing_up(run_dir):
+def test_a_pipe_in_the_place_of_an_unfinished_checkpoint_holds_nothing_up(run_dir):
     (run_dir / FOLDER).mkdir()
-    os.mkfifo(run_dir / FOLDER / ".deleted")
+    os.mkfifo(run_dir / FOLDER / ".000000000010.unfinished")
     save(run_dir, *RATES, keep=1)
     assert checkpoint_steps(run_dir) == [0, 20, 60]
 
@@ -210,17 +212,6 @@ def test_a_clock_that_is_set_back_keeps_the_latest_by_their_steps(run_dir, monke
     save(run_dir, 1, (2, 0.9), 3, keep=2)
     save(run_dir, 4, 5, 6, keep=2)
     assert checkpoint_steps(run_dir) == [1, 2, 5, 6]
-
-
-def test_the_folder_of_old_checkpoints_is_kept_while_one_is_being_moved(run_dir):
-    with CheckpointStore(run_dir, keep=1) as store:
-        moved = run_dir / FOLDER / ".deleted"
-        (moved / "1").mkdir(parents=True)
-        before = moved.stat()
-        store.save(1, {"tree": TREE}, {}, None)
-        assert moved.stat().st_ino == before.st_ino
-        assert list(moved.iterdir()) == []
-    assert not moved.exists()
 
 
 def test_the_best_of_an_earlier_process_stays(run_dir):
@@ -282,19 +273,33 @@ def test_a_write_that_fails_on_the_way_costs_one_line_and_no_other_checkpoint(
     assert not caplog.records
 
 
-@pytest.mark.parametrize("method", ["save", "wait_until_finished", "close"])
-def test_an_error_of_orbax_while_writing_is_one_line(run_dir, monkeypatch, method):
-    def fail(*arguments, **keywords):
+@pytest.mark.parametrize("name", ["write_arrays", "sync_tree", "move"])
+@pytest.mark.parametrize("steps", [(2,), (2, 3)], ids=["the last", "another follows"])
+def test_an_error_while_writing_is_one_line(run_dir, monkeypatch, name, steps):
+    def fail(*arguments):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def use():
-        with CheckpointStore(run_dir, keep=50) as store:
-            store.save(2, {"tree": TREE}, {}, None)
-
     save(run_dir, 1)
-    monkeypatch.setattr(ocp.CheckpointManager, method, fail)
-    assert "No space left on device; the earlier ones" in refused(use)
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint_store, name, fail)
+        assert "No space left on device; the earlier ones" in refused(save, run_dir, *steps)
+    assert os.listdir(run_dir / FOLDER) == [checkpoint_path(run_dir, 1).name]
     assert digest(read(run_dir, 1)) == digest(TREE)
+    save(run_dir, *steps)
+    assert checkpoint_steps(run_dir) == [1, *steps]
+
+
+def test_a_training_goes_on_while_a_checkpoint_is_written(run_dir, monkeypatch):
+    may_go_on = threading.Event()
+    sync_tree = checkpoint_store.sync_tree
+    monkeypatch.setattr(
+        checkpoint_store, "sync_tree", lambda path: may_go_on.wait(60) and sync_tree(path)
+    )
+    with CheckpointStore(run_dir, keep=50) as store:
+        store.save(1, {"tree": TREE}, {}, None)
+        assert checkpoint_steps(run_dir) == []
+        may_go_on.set()
+    assert checkpoint_steps(run_dir) == [1]
 
 
 def test_a_long_reason_keeps_its_beginning_and_its_end(run_dir, monkeypatch):
@@ -304,7 +309,7 @@ def test_a_long_reason_keeps_its_beginning_and_its_end(run_dir, monkeypatch):
         told = f" the end [source locations='{places}']"
         raise ValueError("RESOURCE_EXHAUSTED: " + 1_000 * "x" + told + "\nand more")
 
-    monkeypatch.setattr(ocp.CheckpointManager, "save", fail)
+    monkeypatch.setattr(checkpoint_store, "write_arrays", fail)
     said = refused(save, run_dir, 1)
     assert "RESOURCE_EXHAUSTED: xxx" in said
     assert "xxx the end; the earlier" in said

@@ -291,7 +291,7 @@ def test_a_finished_run_is_not_trained_again(config, smoke_run, run_copy, same, 
 def test_a_run_without_a_checkpoint_starts_from_the_beginning(config, smoke_run, tmp_path, same):
     for name in ("config.yaml", "versions.json", "metrics.jsonl"):
         shutil.copy(smoke_run / name, tmp_path)
-    left = tmp_path / FOLDER / "000000000000.orbax-checkpoint-tmp"
+    left = tmp_path / FOLDER / ".000000000000.unfinished"
     left.mkdir(parents=True)
     assert session.run(config, tmp_path).finished
     assert not left.exists()
@@ -304,7 +304,7 @@ def files_of(path):
 
 def data(path):
     """The files that hold the arrays, not those that tell where in them each lies."""
-    return files_of(path / "ocdbt.process_0" / "d")
+    return files_of(path / "d")
 
 
 def cut(path):
@@ -576,10 +576,10 @@ def test_the_best_checkpoint_does_not_lose_its_score_while_the_drive_does_not_an
 
 
 HARMLESS = {
-    "leftover": lambda newest: (newest.parent / "000000081920.orbax-checkpoint-tmp-1").mkdir(),
+    "leftover": lambda newest: (newest.parent / ".000000081920.unfinished").mkdir(),
     "stray folder": lambda newest: (newest.parent / "99999").mkdir(),
     "stray file": lambda newest: (newest.parent / "notes.txt").write_text("mine"),
-    "no metadata of Orbax": lambda newest: (newest / "_CHECKPOINT_METADATA").unlink(),
+    "no metadata of Orbax": lambda newest: (newest / POLICY / "_METADATA").unlink(),
     "nothing": lambda newest: None,
 }
 
@@ -942,8 +942,8 @@ def full_tensorboard(monkeypatch):
 
 
 def full_store(monkeypatch):
-    original = ocp.CheckpointManager.save
-    monkeypatch.setattr(ocp.CheckpointManager, "save", third(no_space, original))
+    original = checkpoint_store.sync_tree
+    monkeypatch.setattr(checkpoint_store, "sync_tree", third(no_space, original))
 
 
 FULL = {

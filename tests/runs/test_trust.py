@@ -523,7 +523,7 @@ def test_nothing_is_recorded_of_the_packages_own_task(run, home):
 LINKED = (
     *(".lock", "train.log", "metrics.jsonl", "evaluations", "videos/000000000000"),
     *("evaluations/000000000000/report.html", "policy", "page.html", "tensorboard"),
-    *("checkpoints/.deleted", "nan_dumps/new.npz"),
+    *("checkpoints/.000000000001.unfinished", "nan_dumps/new.npz"),
 )
 
 

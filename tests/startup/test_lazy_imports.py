@@ -62,18 +62,16 @@ install_lazy_imports()
 {then}
 import jetbot_mjx.training.session
 from jetbot_mjx.config import Config
-from jetbot_mjx.runs import checkpoint_manager
 from jetbot_mjx.runs import Setup
 from jetbot_mjx.training.ppo_trainer import build_ppo
 ppo = build_ppo(Setup(Config()))
 heavy = ["PIL.Image", "flax.linen", "glfw", "jax.extend.pallas", "jaxopt",
-    "orbax.checkpoint.experimental.v1", "scipy.optimize", "scipy.spatial",
+    "orbax", "scipy.optimize", "scipy.spatial",
     "tensorboardX.comet_utils", "torch", "trimesh"]
 print(*[name for name in heavy if name in sys.modules])
 print(type(ppo.networks.policy_network).__name__)
-import flax, jax.extend, orbax.checkpoint
+import flax, jax.extend
 print(flax.linen.Dense(3).features, jax.extend.pallas.__name__)
-print(orbax.checkpoint.v1.__name__, callable(orbax.checkpoint.v1.save_pytree))
 from brax.generalized import constraint
 print(constraint.jaxopt.ProjectedGradient.__name__)
 import inspect
@@ -97,7 +95,6 @@ def test_a_training_loads_nothing_heavy_and_all_of_it_is_there_when_asked_for(th
         "",
         "FeedForwardNetwork",
         "3 jax.extend.pallas",
-        "orbax.checkpoint.experimental.v1 True",
         "ProjectedGradient",
         "ConvexHull True",
     ]

@@ -1,0 +1,64 @@
+"""Write arrays with TensorStore in the format of Orbax, which takes five times as long for it."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import tensorstore as ts
+
+_CONTEXT = ts.Context(
+    {
+        # Two threads are enough for one checkpoint at a time, and leave the others to the training.
+        "data_copy_concurrency": {"limit": 2},
+        "file_io_concurrency": {"limit": 2},
+        # The caller syncs all files at once.
+        "file_io_sync": False,
+    }
+)
+
+
+def write_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays, which Orbax's `StandardCheckpointer` can read.
+
+    Args:
+      folder: the folder to create.
+      arrays: the arrays by name.
+
+    Raises:
+      Exception: TensorStore could not write them; it raises many kinds.
+    """
+    folder.mkdir()
+    files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder}/"}}
+    with ts.Transaction() as transaction:
+        for name, array in arrays.items():
+            place = {**files, "path": f"{name}/"}
+            store = ts.open(
+                {"driver": "zarr", "kvstore": place, "store_data_equal_to_fill_value": True},
+                create=True,
+                dtype=array.dtype,
+                shape=array.shape,
+                chunk_layout=ts.ChunkLayout(chunk_shape=[max(1, size) for size in array.shape]),
+                transaction=transaction,
+                context=_CONTEXT,
+            ).result()
+            store.write(array).result()
+    (folder / "_METADATA").write_text(json.dumps(_metadata(arrays)))
+
+
+def _metadata(names: Mapping[str, np.ndarray]) -> Mapping[str, object]:
+    """Return what Orbax reads before the arrays."""
+    value = {"value_type": "np.ndarray", "skip_deserialize": False}
+    return {
+        "tree_metadata": {
+            str((name,)): {
+                "key_metadata": [{"key": name, "key_type": 2}],
+                "value_metadata": value,
+            }
+            for name in names
+        },
+        "use_ocdbt": True,
+        "use_zarr3": False,
+        "store_array_data_equal_to_fill_value": True,
+        "custom_metadata": None,
+    }
