@@ -8,6 +8,7 @@ import contextlib
 import errno
 import math
 import numbers
+import os
 import reprlib
 from collections.abc import Iterator
 from typing import TextIO
@@ -180,6 +181,24 @@ NO_ANSWER = {
     *(errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH),
 }
 """Errors by which a drive, such as one on a network, says nothing of the file asked for."""
+
+
+class UnreadableError(UserError):
+    """Raised when a drive does not answer, so that nobody knows what it holds."""
+
+
+def check_answer(number: int | None, what: object) -> None:
+    """Raise an `UnreadableError` if an error of the system says that a drive did not answer.
+
+    Args:
+      number: the number of the error.
+      what: the file or the checkpoint that was to be read.
+    """
+    if number in NO_ANSWER:
+        raise UnreadableError(
+            f"{what} cannot be read now: {os.strerror(number)}: it may be intact: give the same"
+            " command again when the drive answers"
+        ) from None
 
 
 def unanswered(error: OSError) -> str:

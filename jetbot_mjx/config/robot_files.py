@@ -13,7 +13,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from jetbot_mjx.config.errors import ConfigError, ConfigNotFoundError
-from jetbot_mjx.errors import shown
+from jetbot_mjx.errors import check_answer, shown
 
 FOLDER = "robot"
 """Folder of a run that holds the files of its robot's model."""
@@ -202,6 +202,7 @@ def _read(path: Path, root: Path, files: dict[str, bytes]) -> bytes:
     except FileNotFoundError:
         raise ConfigNotFoundError(f"robot.file {path} does not exist") from None
     except OSError as error:
+        check_answer(error.errno, f"robot.file {path}")
         raise ConfigError(f"robot.file {path} cannot be read: {error.strerror}") from None
     try:
         name = path.resolve().relative_to(root.resolve()).as_posix()

@@ -46,9 +46,10 @@ import tensorstore as ts
 from jaxtyping import PyTree
 
 from jetbot_mjx.errors import (
-    NO_ANSWER,
     NotFoundError,
+    UnreadableError,
     UserError,
+    check_answer,
     clipped,
     os_errors,
     shown,
@@ -92,10 +93,6 @@ class CheckpointError(UserError):
 
 class CheckpointNotFoundError(CheckpointError, NotFoundError):
     """Raised when there is no checkpoint at a path."""
-
-
-class UnreadableError(UserError):
-    """Raised when a drive does not answer, so that nobody knows what it holds."""
 
 
 class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
@@ -301,8 +298,7 @@ def read_about(path: Path, required: Sequence[str] = ()) -> JsonObject:
     # Read the file and compare it with its own digest.
     file = path / _ABOUT / "metadata"
     try:
-        with _answers(path):
-            text = read_text(file)
+        text = read_text(file)
         about = json.loads(text)
         stored_digest = about[_DIGESTS].pop(_ABOUT)
         is_intact = stored_digest == _digest_json(about)
@@ -405,12 +401,8 @@ def _answers(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if (number := _error_number(error)) not in NO_ANSWER:
-            raise
-        raise UnreadableError(
-            f"checkpoint {path} cannot be read now: {os.strerror(number)}: it may be intact: give"
-            " the same command again when the drive answers"
-        ) from None
+        check_answer(_error_number(error), f"checkpoint {path}")
+        raise
 
 
 def _error_number(error: Exception) -> int | None:

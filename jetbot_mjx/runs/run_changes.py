@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from jetbot_mjx.errors import NotFoundError, UserError, os_errors
-from jetbot_mjx.runs.run_dir import CONFIG, DamagedRunError, occupied, read_config
+from jetbot_mjx.runs.run_dir import CONFIG, occupied, read_config
 from jetbot_mjx.runs.run_finder import (
     PRETRAINED,
     ROOT,
     RunInfo,
+    Unusable,
     format_score,
     read_info,
     runs_table,
@@ -43,7 +44,7 @@ def list_runs(
       as_json: whether to return JSON, with the runs of `folder` alone.
     """
 
-    def chosen(folder: Path) -> tuple[list[RunInfo], list[DamagedRunError]]:
+    def chosen(folder: Path) -> tuple[list[RunInfo], list[Unusable]]:
         found, damaged = scan_runs(folder)
         found = [run for run in found if text.lower() in f"{run.name} {run.task}".lower()]
         return sorted(found, key=_ORDERS[sort]), [] if text else damaged

@@ -32,7 +32,7 @@ from jetbot_mjx.config import (
     register,
 )
 from jetbot_mjx.envs import LIBRARIES, installed_version
-from jetbot_mjx.errors import UserError, clipped, os_errors, shown
+from jetbot_mjx.errors import UserError, check_answer, clipped, os_errors, shown
 from jetbot_mjx.runs.durable import exchange, make_folders, move, sync_tree
 
 try:
@@ -103,6 +103,7 @@ def read_config(run_dir: Path) -> Config:
     Raises:
       DamagedRunError: the file is missing, cannot be read or is not one that a training wrote
         completely.
+      UnreadableError: the drive does not answer.
     """
     try:
         text = read_text(run_dir / CONFIG)
@@ -379,11 +380,16 @@ def read_bytes(path: Path) -> bytes:
 
     Raises:
       OSError: it cannot be read, is not a regular file, or is larger than any that a run has.
+      UnreadableError: the drive does not answer.
     """
-    with open(path, "rb", opener=open_at_once) as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise OSError(errno.EINVAL, "it is not a regular file")
-        content = file.read(_MOST_BYTES + 1)
+    try:
+        with open(path, "rb", opener=open_at_once) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise OSError(errno.EINVAL, "it is not a regular file")
+            content = file.read(_MOST_BYTES + 1)
+    except OSError as error:
+        check_answer(error.errno, path)
+        raise
     if len(content) > _MOST_BYTES:
         raise OSError(errno.EFBIG, f"it is larger than {_MOST_BYTES // 1_000_000} MB")
     return content
@@ -394,6 +400,7 @@ def read_text(path: Path) -> str:
 
     Raises:
       OSError: as for `read_bytes`.
+      UnreadableError: as for `read_bytes`.
       UnicodeDecodeError: it is not UTF-8.
     """
     return read_bytes(path).decode()

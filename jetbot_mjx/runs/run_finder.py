@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jetbot_mjx.config import Config, run_around
-from jetbot_mjx.errors import NotFoundError, UserError, clipped, os_errors, printable
+from jetbot_mjx.errors import (
+    NotFoundError,
+    UnreadableError,
+    UserError,
+    clipped,
+    os_errors,
+    printable,
+)
 from jetbot_mjx.runs import hub
 from jetbot_mjx.runs.metrics import METRICS, read_history
 from jetbot_mjx.runs.run_dir import (
@@ -37,6 +44,10 @@ PRETRAINED = Path(__file__).parents[1] / "assets" / "pretrained"
 _LATEST = "latest"
 _PREFIX = "pretrained:"
 _HUB = "hub"
+
+
+Unusable = DamagedRunError | UnreadableError
+"""Why a list has no line of a run."""
 
 
 class RunInfo(NamedTuple):
@@ -98,13 +109,14 @@ def find_run(name: str | Path, root: Path = ROOT, say: Callable[[str], None] | N
     if os.path.lexists(text):
         return Path(name)
     if text == _LATEST:
-        runs, damaged = scan_runs(root)
+        runs, unusable = scan_runs(root)
+        reason = f"there is no run in {root}/: train one first"
+        for one in reversed(unusable):
+            if isinstance(one, UnreadableError):
+                raise one
+            reason = f"every run in {root}/ is damaged, such as {one.run_dir.name}: {one.reason}"
         if runs:
             return runs[0].path
-        reason = f"there is no run in {root}/: train one first"
-        if damaged:
-            one = damaged[0]
-            reason = f"every run in {root}/ is damaged, such as {one.run_dir.name}: {one.reason}"
         raise NotFoundError(f"{_LATEST}: {reason}")
     if Path(text).name == text and os.path.lexists(root / text):
         return root / text
@@ -131,7 +143,7 @@ def find_run_config(run_dir: Path) -> Config:
     return config
 
 
-def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[DamagedRunError]]:
+def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[Unusable]]:
     """Return the runs in the subfolders of a folder, the latest first, and the others' errors.
 
     Args:
@@ -149,7 +161,7 @@ def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[DamagedRunError]]:
         if any(os.path.lexists(folder / name) for name in (CONFIG, METRICS)):
             try:
                 runs.append(read_info(folder))
-            except DamagedRunError as error:
+            except (DamagedRunError, UnreadableError) as error:
                 damaged.append(error)
     return sorted(runs, key=lambda run: -run.changed), damaged
 
@@ -159,6 +171,7 @@ def read_info(run_dir: Path) -> RunInfo:
 
     Raises:
       DamagedRunError: its configuration or its metrics cannot be read.
+      UnreadableError: the drive does not answer.
     """
     config = read_config(run_dir)
     try:
@@ -166,6 +179,8 @@ def read_info(run_dir: Path) -> RunInfo:
         seeds = sorted(run_dir.glob(f"seed-*/{METRICS}"))
         history = read_history(seeds[0] if seeds else run_dir / METRICS)
         changed = history[-1].timestamp if history else (run_dir / CONFIG).stat().st_mtime
+    except UnreadableError:
+        raise
     except (UserError, OSError) as error:
         raise DamagedRunError(run_dir, str(error)) from None
     rates = [line.metrics.get("eval/success_rate") for line in history]
@@ -183,7 +198,7 @@ def read_info(run_dir: Path) -> RunInfo:
     )
 
 
-def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRunError] = ()) -> str:
+def runs_table(runs: Sequence[RunInfo], damaged: Sequence[Unusable] = ()) -> str:
     """Return a list of runs as text, one line each, or a line that says there are none.
 
     Args:
@@ -206,8 +221,13 @@ def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRunError] = ())
         lines = ["no runs here: train one, or use one that comes with the package: pretrained:NAME"]
     if any(run.env_steps < run.num_timesteps for run in runs):
         lines.append("* stopped before its last step, or reached stop_at_success or stop_at_return")
-    lines += [printable(f"damaged: {_shortest_name(one.run_dir)}: {one.reason}") for one in damaged]
-    return "\n".join(lines)
+    return "\n".join([*lines, *(printable(_why_not(one)) for one in damaged)])
+
+
+def _why_not(error: Unusable) -> str:
+    if isinstance(error, UnreadableError):
+        return str(error)
+    return f"damaged: {_shortest_name(error.run_dir)}: {error.reason}"
 
 
 def format_score(run: RunInfo) -> str:

@@ -1,9 +1,11 @@
 """Names of result folders: a short evaluation replaces no fuller one."""
 
+import errno
 import json
 
 import pytest
 
+from jetbot_mjx.errors import UnreadableError
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
 from jetbot_mjx.evaluation.result_names import (
     PARTS,
@@ -12,6 +14,7 @@ from jetbot_mjx.evaluation.result_names import (
     name_with_count,
     report_folder,
 )
+from jetbot_mjx.runs import run_dir
 
 STEPS = "000000065536"
 ALL, NONE = frozenset(PARTS), frozenset()
@@ -117,3 +120,13 @@ def test_the_report_that_is_kept_is_named(tmp_path):
     write(full, REPORT_GOALS, NONE)
     assert fuller_report(few, STEPS) == full
     assert fuller_report(full, STEPS) is None
+
+
+def test_a_report_on_a_drive_that_does_not_answer_is_not_replaced(tmp_path, monkeypatch):
+    def no_answer(path, flags):
+        raise OSError(errno.EIO, "Input/output error")
+
+    write(tmp_path / STEPS, REPORT_GOALS, ALL)
+    monkeypatch.setattr(run_dir, "open_at_once", no_answer)
+    with pytest.raises(UnreadableError, match="cannot be read now"):
+        report_folder(tmp_path, STEPS, REPORT_GOALS, NONE)

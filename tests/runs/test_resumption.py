@@ -29,7 +29,7 @@ from jetbot_mjx.config import CHANGEABLE_ON_RESUME
 from jetbot_mjx.devices import compiler_options
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator
-from jetbot_mjx.runs import Setup, checkpoint_store, metrics
+from jetbot_mjx.runs import Setup, checkpoint_store, metrics, run_dir
 from jetbot_mjx.runs.checkpoint import POLICY
 from jetbot_mjx.runs.checkpoint_store import (
     FOLDER,
@@ -550,7 +550,7 @@ def no_answer_to_tensorstore(*given, **named):
     ("place", "name", "fail"),
     [
         (os, "listdir", no_answer),
-        (checkpoint_store, "read_text", no_answer),
+        (run_dir, "open_at_once", no_answer),
         (checkpoint_store, "_count_bytes", no_answer),
         (checkpoint_store.ts, "open", no_answer_to_tensorstore),
     ],
@@ -570,7 +570,7 @@ def test_a_drive_that_does_not_answer_costs_no_checkpoint(
 def test_the_best_checkpoint_does_not_lose_its_score_while_the_drive_does_not_answer(
     run_copy, monkeypatch
 ):
-    monkeypatch.setattr(checkpoint_store, "read_text", no_answer)
+    monkeypatch.setattr(run_dir, "open_at_once", no_answer)
     with pytest.raises(UnreadableError):
         CheckpointStore(run_copy, keep=1)
 

@@ -1,5 +1,6 @@
 """The run folder: one training at a time, no foreign files, every file whole."""
 
+import errno
 import json
 import os
 import subprocess
@@ -12,8 +13,8 @@ import pytest
 
 from helpers.own_robots import copy_robot, load_robot
 from jetbot_mjx.config import load_config, parse_config
-from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs import run_dir
+from jetbot_mjx.errors import UnreadableError, UserError
+from jetbot_mjx.runs import read_history, read_task_code, run_dir, wandb_sink
 from jetbot_mjx.runs.run_dir import (
     DamagedRunError,
     atomic_folder,
@@ -148,6 +149,31 @@ def test_a_damaged_configuration_is_refused(tmp_path, text):
     said = refused(stored_config, tmp_path)
     assert said.startswith(f"the run {tmp_path} is damaged: config.yaml")
     assert said.endswith("restore the file, or train into a new folder")
+
+
+READERS = {
+    "config.yaml": stored_config,
+    "versions.json": changed_versions,
+    "metrics.jsonl": lambda run: read_history(run / "metrics.jsonl"),
+    "task/sources.json": read_task_code,
+    "wandb.json": lambda run: wandb_sink._read(run / "wandb.json", "project"),
+}
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ETIMEDOUT])
+@pytest.mark.parametrize("name", READERS)
+def test_a_file_on_a_drive_that_does_not_answer_is_neither_damaged_nor_missing(
+    tmp_path, monkeypatch, name, number
+):
+    def no_answer(path, flags):
+        raise OSError(number, os.strerror(number))
+
+    write_text(tmp_path / "config.yaml", "")
+    monkeypatch.setattr(run_dir, "open_at_once", no_answer)
+    with pytest.raises(UnreadableError) as caught:
+        READERS[name](tmp_path)
+    said = f"{tmp_path / name} cannot be read now: {os.strerror(number)}: it may be intact: give"
+    assert str(caught.value).startswith(said)
 
 
 def test_each_seed_has_a_folder_of_its_own(tmp_path):

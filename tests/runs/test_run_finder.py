@@ -1,5 +1,6 @@
 """Runs by name, lists of runs, and the errors for unknown names."""
 
+import errno
 import json
 import os
 import re
@@ -9,7 +10,8 @@ import pytest
 
 from helpers.run_folders import make_run
 from jetbot_mjx import list_runs as list_runs_command
-from jetbot_mjx.errors import NotFoundError
+from jetbot_mjx.errors import NotFoundError, UnreadableError
+from jetbot_mjx.runs import run_dir
 from jetbot_mjx.runs.checkpoint import find_checkpoint, load_checkpoint, load_policy
 from jetbot_mjx.runs.checkpoint_store import CheckpointError
 from jetbot_mjx.runs.run_dir import DamagedRunError
@@ -137,6 +139,26 @@ def test_a_damaged_run_is_listed_with_the_reason_and_stops_no_other(runs, capsys
     assert older.startswith("older ")
     assert damaged.startswith("damaged: newer: config.yaml")
     assert said in damaged
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "metrics.jsonl"])
+def test_a_run_on_a_drive_that_does_not_answer_is_not_damaged(runs, monkeypatch, capsys, name):
+    opened = run_dir.open_at_once
+
+    def open_or_not(path, flags):
+        if os.fspath(path).endswith(f"newer/{name}"):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return opened(path, flags)
+
+    monkeypatch.setattr(run_dir, "open_at_once", open_or_not)
+    said = f"runs/newer/{name} cannot be read now: Input/output error"
+    assert list_runs_command.main(["runs"]) == 0
+    _, older, unreadable = capsys.readouterr().out.splitlines()
+    assert older.startswith("older ")
+    assert unreadable.startswith(said)
+    # What is the latest is not known.
+    with pytest.raises(UnreadableError, match=said):
+        find_run("latest")
 
 
 @pytest.mark.slow
