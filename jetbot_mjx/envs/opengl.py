@@ -10,6 +10,7 @@ import importlib
 import os
 import subprocess
 import sys
+import types
 import weakref
 from collections.abc import Iterable
 
@@ -31,6 +32,8 @@ context = importlib.import_module("mujoco.{backend}").GLContext(64, 64)
 context.make_current()
 mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), 150)
 """
+
+_PLATFORM = "PYOPENGL_PLATFORM"
 
 _REMEDY_LINUX = (
     "install one of libegl1 with a GPU driver or libegl-mesa0, or"
@@ -65,8 +68,7 @@ class SceneRenderer:
         self.scene = mujoco.MjvScene(mj_model, max_geoms)
         """What `render` renders."""
         self._rect = mujoco.MjrRect(0, 0, self.width, self.height)
-        back_end = importlib.import_module(f"mujoco.{find_backend()}")
-        self._gl = back_end.GLContext(self.width, self.height)
+        self._gl = _import_back_end().GLContext(self.width, self.height)
         _open.add(self)
         _end_at_exit()
         self._gl.make_current()
@@ -126,6 +128,16 @@ class SceneRenderer:
         _open.discard(self)
         self._gl.free()
         del self._gl
+
+
+def _import_back_end() -> types.ModuleType:
+    """Import MuJoCo's module of the back end, and leave the environment of the process as it is."""
+    was_set = _PLATFORM in os.environ
+    module = importlib.import_module(f"mujoco.{find_backend()}")
+    if not was_set:
+        # The module sets it for PyOpenGL, which has read it by now.
+        os.environ.pop(_PLATFORM, None)
+    return module
 
 
 _open: "weakref.WeakSet[SceneRenderer]" = weakref.WeakSet()
