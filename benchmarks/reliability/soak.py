@@ -6,9 +6,6 @@ them: one drifts if its slope is larger than three times its standard error, and
 than a hundredth over the whole time. With `--kills`, other trainings are killed at random moments
 and resumed until they end as one that was never disturbed, again and again until there were so many
 kills, five of six by SIGKILL and one by SIGTERM. `--jobs` of them run at a time.
-
-A checkpoint leaves about 7 KB in TensorStore 0.1.86, which its authors have to mend: so much growth
-of the memory an interval is told, and is no drift.
 """
 
 import argparse
@@ -51,9 +48,6 @@ _LARGEST_CHANGE = 0.01
 """Change over the whole time, relative to the mean, that is no drift."""
 _CERTAIN = 3.0
 """Standard errors that a slope has at least if it is one."""
-
-_KNOWN_SLOPES = {"memory": 10_000.0}
-"""Slopes that are known and no drift: bytes that an interval's checkpoint leaves in TensorStore."""
 
 QUANTITIES = {
     "memory": "resident memory [bytes]",
@@ -113,9 +107,8 @@ def fit(quantity: str, values: Sequence[float]) -> Slope:
     mean, slope = float(used.mean()), float(at @ used / (at @ at))
     rest = used - mean - slope * at
     error = float(np.sqrt(rest @ rest / (len(used) - 2) / (at @ at)))
-    beyond = max(abs(slope) - _KNOWN_SLOPES.get(quantity, 0.0), 0.0)
-    is_certain = beyond > _CERTAIN * error
-    drifts = is_certain and beyond * len(used) > _LARGEST_CHANGE * abs(mean)
+    is_certain = abs(slope) > _CERTAIN * error
+    drifts = is_certain and abs(slope) * len(used) > _LARGEST_CHANGE * abs(mean)
     return Slope(quantity, mean, slope, error, bool(drifts))
 
 

@@ -32,7 +32,6 @@ GROWING = np.arange(200.0)
     ("quantity", "values", "drifts"),
     [
         ("memory", 1e9 + NOISE, False),
-        ("memory", 1e9 + NOISE + 7_000 * GROWING, False),  # what each checkpoint leaves
         ("memory", 1e9 + NOISE + 200_000 * GROWING, True),
         ("files", np.full(200, 31.0), False),
         ("files", 31 + GROWING // 20, True),
