@@ -47,7 +47,6 @@ Student, Biometrika 6 (1908), 1-25, doi:10.1093/biomet/6.1.1.
 import argparse
 import itertools
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -63,6 +62,7 @@ from jaxtyping import Array, Float
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks import CONFIGS, RESULTS
+from benchmarks.harness.timing import available_cores
 from jetbot_mjx import cli
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.config import Config, RobotConfig, load_config, parse_config
@@ -384,7 +384,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         {
             "overrides": options.overrides,
             "episodes": options.episodes,
-            "cpu_cores": os.cpu_count(),
+            "cpu_cores": available_cores(),
             "versions": versions(),
             "results": results,
         },

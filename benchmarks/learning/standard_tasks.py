@@ -35,6 +35,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import RESULTS, ROOT
 from benchmarks.harness.processes import last_within
 from benchmarks.harness.results import check_output, write
+from benchmarks.harness.timing import available_cores
 from benchmarks.learning.time_to_success import RETURN, SUCCESS, Target, measure, processor
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
@@ -285,7 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _with_many_seeds(names: Sequence[str], options: argparse.Namespace, output: Path) -> bool:
     """Measure the configurations for a GPU; return whether every training reached its target."""
     tasks: dict[str, Any] = {}
-    results = {"cpu_cores": os.cpu_count(), "processor": processor(), "tasks": tasks}
+    results = {"cpu_cores": available_cores(), "processor": processor(), "tasks": tasks}
     print(
         "| task | target | cold | warm, median (worst) | steps | in the report |\n"
         "|---|--:|--:|--:|--:|--:|",
@@ -312,7 +313,7 @@ def _beside_sb3(names: Sequence[str], options: argparse.Namespace, output: Path)
         "seed": options.seed,
         "limit": options.limit,
         "episodes": _EPISODES,
-        "cpu_cores": os.cpu_count(),
+        "cpu_cores": available_cores(),
         "processor": processor(),
         "packages": {name: importlib.import_module(name).__version__ for name in packages},
         "settings": {name: TASKS[name]._asdict() for name in names},

@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.harness.processes import run_module
+from benchmarks.harness.timing import available_cores
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
@@ -191,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         seconds = [run["process_seconds"] for run in runs if run["start"] == start]
         print(
             f"{start}: median time of the process {statistics.median(seconds):.1f} s on"
-            f" {machine['device_count']} x {machine['device']}, {os.cpu_count()} CPU cores"
+            f" {machine['device_count']} x {machine['device']}, {available_cores()} CPU cores"
         )
     print(f"results: {options.output}")
     return 0 if all(target.is_reached(run["policy"]) for run in runs) else 1
@@ -212,7 +213,7 @@ def _results(
         "overrides": options.overrides,
         "metric": target.metric,
         "target": target.value,
-        "cpu_cores": os.cpu_count(),
+        "cpu_cores": available_cores(),
         "processor": processor(),
         "config": config.model_dump(mode="json"),
         "runs": runs,

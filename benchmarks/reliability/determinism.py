@@ -7,7 +7,6 @@ steps/s (median over the intervals of each run, without compilation and evaluati
 """
 
 import json
-import os
 import re
 import statistics
 import sys
@@ -19,6 +18,7 @@ from typing import NamedTuple
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.harness.processes import run_module
+from benchmarks.harness.timing import available_cores
 from jetbot_mjx import cli
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
@@ -106,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(
         f"deterministic: {'bit-identical' if same else 'DIFFERENT BITS'}, {rates[1] / rates[0]:.2f}"
         f" x the speed of the default, on {versions['device_count']} x {versions['device']},"
-        f" {os.cpu_count()} CPU cores"
+        f" {available_cores()} CPU cores"
     )
     if options.output:
         values = {"versions": versions, "config": config.model_dump(mode="json")}

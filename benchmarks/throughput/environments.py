@@ -36,7 +36,7 @@ from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import MissingPackageError, UserError
 from jetbot_mjx.packed import pack
 
-_LIBRARIES: Mapping[str, Mapping[str, object]] = {
+LIBRARIES: Mapping[str, Mapping[str, object]] = {
     "Brax inverted_pendulum": {
         "environment": "brax.envs:get_environment",
         "environment_options": {"env_name": "inverted_pendulum", "backend": "mjx"},
@@ -53,6 +53,7 @@ _LIBRARIES: Mapping[str, Mapping[str, object]] = {
         "environment_options": {"env_id": "Pendulum-v1"},
     },
 }
+"""Settings of one environment of each library."""
 
 _BATCHES = {"cpu": (256, 4_096), "gpu": (4_096, 65_536)}
 _EPISODE_LENGTH = 200
@@ -128,7 +129,7 @@ def _configs(names: Sequence[str]) -> dict[str, Config]:
     if names:
         return {Path(name).stem: load_config(name) for name in names}
     task = {"episode_length": _EPISODE_LENGTH}
-    return {name: parse_config({**one, "task": task}) for name, one in _LIBRARIES.items()}
+    return {name: parse_config({**one, "task": task}) for name, one in LIBRARIES.items()}
 
 
 def _parser() -> argparse.ArgumentParser:

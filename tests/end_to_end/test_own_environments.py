@@ -1,30 +1,46 @@
 """Trainings in an environment of one's own survive kills, and use several devices and seeds."""
 
+import json
+import shutil
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
+from benchmarks import ROOT
 from benchmarks.reliability import torture
 from benchmarks.reliability.torture import SETTINGS, Aim
+from benchmarks.throughput.environments import LIBRARIES
 from helpers import point_mass
-from helpers.further import slow_unless
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
 
 CLASSES = ("PointMass", "Choosing")
+EXAMPLE = ROOT / "examples" / "cartpole.py"
+OTHERS = {**LIBRARIES, "Cartpole": {"environment": f"{EXAMPLE.name}:Cartpole"}}
+"""Settings of the environments that are not a class of the tests."""
 LONGER = (*SETTINGS, "checkpoint_interval=4_096", "ppo.num_timesteps=32_768")
 
 
-@pytest.fixture(scope="module", params=slow_unless("PointMass".__eq__, CLASSES))
+@pytest.fixture(scope="module")
 def config(request, tmp_path_factory):
     path = tmp_path_factory.mktemp("configs") / "own.yaml"
-    path.write_text(point_mass.config(request.param).to_yaml())
+    shutil.copy(EXAMPLE, path.parent)
+    if request.param in CLASSES:
+        text = point_mass.config(request.param).to_yaml()
+    else:
+        settings = OTHERS[request.param]
+        if request.param in LIBRARIES:
+            pytest.importorskip(settings["environment"].partition(":")[0])
+        text = json.dumps({**point_mass.TINY, **settings})
+    path.write_text(text)
     return path
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # those of the libraries
+@pytest.mark.parametrize("config", [*CLASSES, *OTHERS], indirect=True)
 def test_a_training_that_was_killed_ends_as_if_it_had_never_been(config, tmp_path):
     template = torture.make_template(LONGER, config)
     undisturbed = torture.finish(tmp_path / "undisturbed", LONGER, config=config)
@@ -37,6 +53,7 @@ def test_a_training_that_was_killed_ends_as_if_it_had_never_been(config, tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("config", CLASSES, indirect=True)
 def test_two_seeds_train_on_two_devices(config, tmp_path):
     settings = ["--set", "cpu_devices=2", "--set", "seeds=2", "--run-dir", str(tmp_path / "run")]
     command = [sys.executable, "-m", "jetbot_mjx.train", "--config", str(config), *settings]

@@ -636,7 +636,7 @@ def test_an_environment_is_measured_by_kernels_and_by_xla(tmp_path, monkeypatch,
     assert "| mine | 64 |" in capsys.readouterr().out
     # A library that is not installed is skipped, and an environment that gets lost is told.
     absent = {"absent": {"environment": "not_installed_anywhere:make"}}
-    monkeypatch.setattr(environments, "_LIBRARIES", absent)
+    monkeypatch.setattr(environments, "LIBRARIES", absent)
     assert environments.main(given) == 0
     assert json.loads(output.read_text())["rows"] == []
     assert "absent is skipped: environment = 'not_installed" in capsys.readouterr().err
