@@ -33,8 +33,10 @@ def test_a_configuration_is_frozen(section, key):
 def test_a_configuration_shows_what_differs_from_the_defaults():
     config = load_config("jetbot_egocentric", {"seed": 3})
     assert repr(config) == (
-        "Config(seed=3, checkpoint_interval=65536, task=TaskConfig(observation='egocentric'),"
-        " ppo=PPOConfig(num_timesteps=524288, num_envs=256, batch_size=64))"
+        "Config(seed=3, checkpoint_interval=65536, "
+        "task=TaskConfig(observation='egocentric', step_cost=0.02),"
+        " ppo=PPOConfig(num_timesteps=524288, num_envs=256, batch_size=64, learning_rate=0.002,"
+        " discounting=0.97, network=NetworkConfig(activation='swish')))"
     )
     assert repr(Config()) == "Config()"
 

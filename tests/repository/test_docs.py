@@ -331,7 +331,7 @@ def test_the_shipped_files_are_told(root):
     assert names == sorted(path.stem for path in (root / "configs").glob("*.yaml"))
     told = {cells[0].strip("`"): dict(zip(names, cells[1:], strict=True)) for cells in table[1:]}
     assert told["ppo.num_envs"]["gpu"] == "`4096`"
-    assert told["ppo.entropy_cost"]["gpu"] == ""
+    assert told["ppo.clipping_epsilon"]["gpu"] == ""
 
 
 @pytest.mark.parametrize(
