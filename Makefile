@@ -38,7 +38,7 @@ train: RUN := $(RUN)
 train: setup
 	$(BIN)/jetbot-mjx train $(CONFIG) --run-dir $(RUN)
 	$(BIN)/jetbot-mjx evaluate $(RUN)
-	-$(BIN)/jetbot-mjx render $(RUN) --episodes 8
+	-$(BIN)/jetbot-mjx render $(RUN) --episodes 4
 	@echo "everything is in $(RUN); to use the commands in this shell: source $(BIN)/activate"
 	@echo "then: jetbot-mjx runs --open latest   the report"
 	@echo "      jetbot-mjx play latest          the robot, live in the browser"

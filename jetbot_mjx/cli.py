@@ -96,12 +96,14 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit with code 2."""
         message = errors.printable(" ".join(message.splitlines()))
+        if hint := _LISTS.get(message.removeprefix("the following arguments are required: ")):
+            message += f": {hint}"
         self.exit(USER_ERROR, f"{self.prog}: error: {message} (--help lists the arguments)\n")
 
 
 _LISTS = {
     "CONFIG": f"`{PROGRAM} configs` lists the configurations",
-    "RUN": f"`{PROGRAM} runs` lists the runs",
+    "RUN": f"`{PROGRAM} runs` lists the runs, and latest is the newest",
 }
 """The command that lists the possible values of an argument, by the name of the value."""
 

@@ -177,7 +177,7 @@ both = pytest.mark.parametrize("command", [evaluate, render], ids=["evaluate", "
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "the following arguments are required: RUN"),
+        ([], "arguments are required: RUN: `jetbot-mjx runs` lists the runs, and latest is"),
         (["run", "--more"], "unrecognized arguments: --more"),
         (["run", "--episodes", "0"], "argument --episodes: 0 is too small: give at least 1"),
         (["run", "--episodes", "-3"], "argument --episodes: -3 is too small: give at least 1"),

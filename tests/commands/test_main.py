@@ -58,7 +58,10 @@ def test_an_unknown_command_is_refused_in_one_line(asked, remedy, capsys):
             ["train"],
             "`jetbot-mjx configs` lists the configurations and `jetbot-mjx runs` lists the",
         ),
-        (["evaluate", "x"], "--list: `jetbot-mjx runs` lists the runs (--help"),
+        (
+            ["evaluate", "x"],
+            "--list: `jetbot-mjx runs` lists the runs, and latest is the newest (--help",
+        ),
         (["tune", "smoke"], "--list: `jetbot-mjx configs` lists the configurations (--help"),
         ([], "there is no command before '--list': did you mean configs or runs?"),
     ],
