@@ -29,7 +29,14 @@ THEN = {"physics.ls_iterations": 4}
 CHANGED = {
     "camera_real": THEN,
     "jetbot_camera": THEN,
-    "jetbot_egocentric": {**THEN, "ppo.num_timesteps": 2_621_440},
+    "jetbot_egocentric": {
+        **THEN,
+        "task.step_cost": 0.0,
+        "ppo.num_timesteps": 2_621_440,
+        "ppo.learning_rate": 1.0e-3,
+        "ppo.discounting": 0.95,
+        "ppo.network.activation": "tanh",
+    },
     "real_jetbot": THEN,
 }
 """What a run that comes with the package changes of its configuration."""
