@@ -1,7 +1,7 @@
 """Check a task or an environment before it is trained: `jetbot-mjx check-env my_env.yaml`.
 
 Every mistake is reported in one line that says how to correct it. Name a configuration, a class as
-`package.module:Class`, or a built-in task by its class alone, such as `GoalTask`. `--config` checks
+`file.py:Class` or `package.module:Class`, or a built-in task by its class alone, such as `GoalTask`. `--config` checks
 a class with the settings of a run. Of an environment of your own, sizes and costs are told, too.
 """
 
@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli, startup
-from jetbot_mjx.config import YAML_ENDINGS, Config, shipped_configs
+from jetbot_mjx.config import YAML_ENDINGS, Config, class_name, shipped_configs
+from jetbot_mjx.errors import InvalidError
 
 BROKEN = 1
 """Exit code for a task or an environment that has an error."""
@@ -31,16 +32,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "what",
         nargs="?",
-        metavar="CONFIG|package.module:Class",
+        metavar="CONFIG|file.py:Class",
         help="a configuration, a task or an environment (default: that of --config)",
     )
     cli.add_config_arguments(parser, positional=False)
     options = parser.parse_args(arguments)
     if not options.what and options.config is None:
-        parser.error("give a configuration, or a class as package.module:Class")
+        parser.error("give a configuration, or a class as file.py:Class")
     if (options.what or "").endswith(".py"):
-        module = options.what.removesuffix(".py").replace("/", ".")
-        parser.error(f"{options.what} is a file: name its class too, as {module}:Class")
+        parser.error(f"{options.what} is a file: name its class too, as {options.what}:Class")
     with startup.exit_on_interrupt():
         from jetbot_mjx import envs
     config = _config(options)
@@ -60,6 +60,11 @@ def _config(options: argparse.Namespace) -> Config:
     what = options.what
     if not what:
         return cli.config_of(options)
+    if ":" in what:
+        try:
+            what = class_name(what)
+        except ValueError as error:
+            raise InvalidError(str(error)) from None
     if options.config is None and (what.endswith(YAML_ENDINGS) or what in shipped_configs()):
         options.config = Path(what)
         return cli.config_of(options)

@@ -57,6 +57,7 @@ class Parser(argparse.ArgumentParser):
                 self.error(f"unrecognized arguments: {name}: {hint}")
             if name.startswith("--") and not any(one.startswith(name) for one in options):
                 self.error(f"unrecognized arguments: {name}{self._remedy(word, name)}")
+        self._refuse_bare_settings(words)
         parsed, extra = self.parse_known_args(words, namespace)
         assert parsed is not None
         if by_position := getattr(parsed, _BY_POSITION, None):
@@ -71,6 +72,18 @@ class Parser(argparse.ArgumentParser):
                 remedy = f": give only one {positionals[0]}"
             self.error(f"unrecognized arguments: {' '.join(extra)}{remedy}")
         return parsed
+
+    def _refuse_bare_settings(self, words: Sequence[str]) -> None:
+        """Refuse `KEY=VALUE` after the value of another argument: it would be taken for a file."""
+        options = self._option_string_actions
+        if "--set" not in options:
+            return
+        for before, word in zip(["", *words], words, strict=False):
+            takes_a_value = before in options and options[before].nargs != 0
+            if word[:1] == "-" or "=" not in word or takes_a_value or os.path.exists(word):
+                continue
+            if remedy := self._remedy(word):
+                self.error(f"unrecognized arguments: {word}{remedy}")
 
     def _remedy(self, word: str, option: str = "") -> str:
         """Return what was probably meant by an unknown argument, or nothing.

@@ -28,6 +28,7 @@ from .run import CHANGEABLE_ON_RESUME as CHANGEABLE_ON_RESUME
 from .run import Config as Config
 from .run import Setting as Setting
 from .task import TaskConfig as TaskConfig
+from .task_modules import class_name as class_name
 from .task_modules import find_task_here as find_task_here
 from .task_modules import import_root as import_root
 from .task_modules import is_task_here as is_task_here

@@ -67,6 +67,4 @@ def find_config(name: str | Path, folders: Sequence[str] = _CONFIGS, what: str =
         return found
     close = difflib.get_close_matches(path.stem, shipped, n=1)
     hint = f"did you mean {close[0]}?" if close else f"give a file, or one of {', '.join(shipped)}"
-    if what == "config" and "=" in path.name:
-        hint = f"did you mean --set {path.name}?"
     raise ConfigNotFoundError(f"{what} {name} does not exist: {hint}")

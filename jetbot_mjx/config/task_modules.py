@@ -26,8 +26,14 @@ def class_name(value: object) -> object:
     if not isinstance(value, str):
         return value
     module, separator, name = value.partition(":")
-    if module.endswith(".py"):
+    if separator and module.endswith(".py"):
         module = ".".join(Path(module.removesuffix(".py")).parts)
+        for part in module.split("."):
+            if not part.isidentifier():
+                raise ValueError(
+                    f"{shown(value)} is wrong: Python cannot import {shown(part)}: rename the file"
+                    " or folder, with letters, digits and underscores only"
+                )
     if separator and all(part.isidentifier() for part in (*module.split("."), *name.split("."))):
         return f"{module}:{name}"
     # Python itself separates a class from its module by a dot.

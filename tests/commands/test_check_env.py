@@ -118,7 +118,7 @@ def test_a_command_that_names_nothing_is_refused(capsys):
     with pytest.raises(SystemExit) as left:
         check_env.main([])
     assert left.value.code == 2
-    assert "give a configuration, or a class as package.module:Class" in capsys.readouterr().err
+    assert "give a configuration, or a class as file.py:Class" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -181,10 +181,6 @@ def test_an_object_that_is_no_configuration_is_refused():
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("GoalTask", "is wrong: write package.module:Class"),
-        ("jetbot_mjx.envs.task.GoalTask", "is wrong: write package.module:Class"),
-        (":GoalTask", "is wrong: write package.module:Class"),
-        ("jetbot_mjx.envs.task:", "is wrong: write package.module:Class"),
         ("no_such_package.task:Task", "there is no no_such_package/task.py beside the YAML file"),
         ("jetbot_mjx.no_such:Task", "there is no jetbot_mjx/no_such.py beside the YAML file"),
         ("jetbot_mjx:GaolTask", "jetbot_mjx has no 'GaolTask'"),

@@ -125,8 +125,9 @@ def test_an_environment_takes_what_is_not_of_the_robot(write, settings):
         ("environment: hopper.Hopper", "or package.module:Class, perhaps hopper:Hopper"),
         (
             "environment: 'my-env.py:Env'",
-            "environment: 'my-env.py:Env' is wrong: write file.py:Class",
+            "environment: 'my-env.py:Env' is wrong: Python cannot import 'my-env': rename the file",
         ),
+        ("environment: 'a b/envs.py:Env'", "Python cannot import 'a b': rename the file or folder"),
         ("environment: examples", "environment: 'examples' is wrong: write file.py:Class"),
         ("environment: examples/", "environment: 'examples/' is wrong: write file.py:Class"),
         ("environment: 3", "environment = 3 is wrong: it should be text"),

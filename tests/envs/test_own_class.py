@@ -47,12 +47,6 @@ def test_a_class_is_found(name, found):
 @pytest.mark.parametrize(
     ("name", "error", "told"),
     [
-        ("own_sound", InvalidError, "write package.module:Class$"),
-        ("own_sound.Env", InvalidError, "write package.module:Class, perhaps own_sound:Env$"),
-        (":Env", InvalidError, "write package.module:Class$"),
-        ("own_sound:", InvalidError, "write package.module:Class$"),
-        (".own_sound:Env", InvalidError, "write package.module:Class$"),
-        ("own_sound.py:Env", InvalidError, "names a file: write the module, own_sound:Env$"),
         ("own_sound:env", InvalidError, "own_sound has no 'env': did you mean 'Env'[?]$"),
         ("own_sound:Env.Other", InvalidError, "Env has no 'Other'$"),
         ("own_half:Env", InvalidError, r"own_half.py, line 1, is not valid Python: "),
