@@ -177,7 +177,8 @@ def common_fields(
 def check_comparable(configs: Mapping[str, Config]) -> None:
     """Raise an error if runs did not train for the same task.
 
-    Their observations, networks and training may differ.
+    Their observations, networks and training may differ, and the cost of a step, which changes
+    neither what is reached nor how fast.
 
     Args:
       configs: the configuration of each run, by the name that the user gave.
@@ -214,7 +215,8 @@ def _task_settings(config: Config) -> JsonObject:
     return {
         key: value
         for key, value in config.flat().items()
-        if key.startswith(("task.", "robot.", "physics.ctrl_dt")) and key != "task.observation"
+        if key.startswith(("task.", "robot.", "physics.ctrl_dt"))
+        and key not in ("task.observation", "task.step_cost")
     }
 
 

@@ -89,7 +89,11 @@ def below_target(
 
 
 def policies_table(policies: Mapping[str, Report]) -> str:
-    """Return a table of policies by name, with the baselines below them."""
+    """Return a table of policies by name, with the baselines below them.
+
+    Where a step does not cost the same for all policies, the table has no returns, which then say
+    nothing about which policy is better.
+    """
     first = next(iter(policies.values()))
     rows = [("", "success", "95 % interval", "to goal", "p95", "path", "return")]
     for name, report in policies.items():
@@ -103,6 +107,8 @@ def policies_table(policies: Mapping[str, Report]) -> str:
     if best := first.best_known:
         times = f"{best.time_to_goal_median:.2f} s", f"{best.time_to_goal_p95:.2f} s"
         rows.append(("best known", "-", "-", *times, "-", "-"))
+    if len({report.config.task.step_cost for report in policies.values()}) > 1:
+        rows = [row[:-1] for row in rows]
     return text_table(rows)
 
 

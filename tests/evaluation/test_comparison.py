@@ -108,6 +108,21 @@ def test_settings_that_differ_are_told():
     assert runs.differences == {"task.observation": ["world", "egocentric"]}
 
 
+def test_a_step_may_cost_more_but_then_no_returns_are_told():
+    settings = {"task": {"step_cost": 0.02}}
+    check_comparable({"a": parse_config({}), "b": parse_config(settings)})
+    alike = [report_of(wins(5)), report_of(wins(5))]
+    assert "return" in policies_table(dict(zip("ab", alike, strict=True)))
+    policies = {"a": report_of(wins(5)), "b": report_of(wins(5), settings=settings)}
+    header, a, b = policies_table(policies).splitlines()[:3]
+    assert "path" in header
+    assert "return" not in header
+    assert max(len(header), len(a), len(b)) < 70
+    assert comparison_of(**{name: [one] for name, one in policies.items()}).differences == {
+        "task.step_cost": [0.0, 0.02]
+    }
+
+
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
