@@ -171,6 +171,22 @@ def test_in_colab_the_first_cell_looks_for_a_gpu(read, name, monkeypatch, capsys
         assert capsys.readouterr().out.partition(";")[0] == told
 
 
+@pytest.mark.parametrize("name", NAMES[:1])
+def test_in_colab_what_its_own_jax_needed_is_taken_away(read, name, monkeypatch):
+    typed = []
+    shell = InteractiveShell()
+    shell.register_magic_function(typed.append, magic_name="pip")
+    monkeypatch.setattr(shell, "system", typed.append)
+    monkeypatch.setitem(sys.modules, "google.colab", types.ModuleType("google.colab"))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    source = read[name].cells[1].source.replace('SOURCE = ""', 'SOURCE = "x.whl"')
+    assert shell.run_cell(source).success
+    installed, removed, library = typed
+    assert installed.startswith("install --quiet x.whl")
+    assert removed == "uninstall -qq --yes jax-cuda12-plugin jax-cuda12-pjrt"
+    assert library == "apt-get -qq install libegl1 libegl-mesa0"
+
+
 def test_every_notebook_is_tested(root):
     assert sorted(path.stem for path in (root / "notebooks").glob("*.ipynb")) == list(NAMES)
 
