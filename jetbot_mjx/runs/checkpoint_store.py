@@ -54,7 +54,7 @@ from jetbot_mjx.errors import (
     os_errors,
     shown,
 )
-from jetbot_mjx.runs.checkpoint_writer import write_arrays
+from jetbot_mjx.runs.checkpoint_writer import key_value_store, write_arrays
 from jetbot_mjx.runs.durable import make_folders, move, sync_tree
 from jetbot_mjx.runs.run_dir import JsonObject, read_text, remove
 
@@ -431,8 +431,7 @@ def _read_arrays(folder: Path, wanted: Mapping[str, _Typed]) -> dict[str, np.nda
             f"checkpoint {folder.parent} cannot be read: {folder.name} is missing"
         ) from None
     stored_bytes = _count_bytes(folder)
-    # TensorStore refuses a path with `..` in it.
-    files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder.resolve()}/"}}
+    files = key_value_store(folder)
     keys = [key.decode() for key in ts.KvStore.open(files).result().list().result()]
     names = [key.removesuffix("/.zarray") for key in keys if key.endswith("/.zarray")]
     stored = {}

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tensorstore as ts
@@ -29,7 +30,7 @@ def write_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
       Exception: TensorStore could not write them; it raises many kinds.
     """
     folder.mkdir()
-    files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder}/"}}
+    files = key_value_store(folder)
     with ts.Transaction() as transaction:
         for name, array in arrays.items():
             place = {**files, "path": f"{name}/"}
@@ -44,6 +45,19 @@ def write_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
             ).result()
             store.write(array).result()
     (folder / "_METADATA").write_text(json.dumps(_metadata(arrays)))
+
+
+def key_value_store(folder: Path) -> dict[str, Any]:
+    """Return what TensorStore calls the specification of the arrays' files in a folder.
+
+    Raises:
+      ValueError: it would find nothing there.
+    """
+    # It refuses a path with `..` in it.
+    path = f"{folder.resolve().as_posix()}/"
+    if "\\" in path or path != path.encode(errors="ignore").decode():
+        raise ValueError("its path has a backslash, or bytes that are not UTF-8: rename the folder")
+    return {"driver": "ocdbt", "base": {"driver": "file", "path": path}}
 
 
 def _metadata(names: Mapping[str, np.ndarray]) -> Mapping[str, object]:

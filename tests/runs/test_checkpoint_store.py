@@ -80,6 +80,24 @@ def test_a_checkpoint_is_read_back_unchanged(run_dir, joined):
     assert about["env_steps"] == 3
 
 
+@pytest.mark.parametrize("given", ["../run", ".", "~", "a\nb", "a'b\"c", "%41", "?x=#1", "link"])
+def test_a_run_folder_may_have_any_name(tmp_path, monkeypatch, given):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "link").symlink_to("run")
+    monkeypatch.chdir(tmp_path / "run")
+    folder = Path(given)
+    folder.mkdir(exist_ok=True)
+    save(folder, 3)
+    monkeypatch.chdir(tmp_path)
+    read(tmp_path / "run" / given, 3)
+
+
+@pytest.mark.parametrize("name", ["a\\b", "\udcff"])
+def test_a_name_that_nothing_could_be_read_from_is_refused(tmp_path, name):
+    (tmp_path / name).mkdir()
+    assert "has a backslash, or bytes that are not UTF-8" in refused(save, tmp_path / name, 3)
+
+
 def test_arrays_changed_while_they_are_saved_are_saved_unchanged(run_dir):
     tree = {"weights": np.zeros(100_000)}
     with CheckpointStore(run_dir, keep=50) as store:
