@@ -233,9 +233,9 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
         except UserError:
             raise
         except Exception as error:
+            left = "; the earlier ones are unchanged" if os.path.isdir(self._folder) else ""
             raise CheckpointError(
-                f"{self._folder}: a checkpoint could not be written: {_reason(error)}; the earlier"
-                " ones are unchanged"
+                f"{self._folder}: a checkpoint could not be written: {_reason(error)}{left}"
             ) from error
 
 

@@ -320,6 +320,15 @@ def test_a_training_goes_on_while_a_checkpoint_is_written(run_dir, monkeypatch):
     assert checkpoint_steps(run_dir) == [1]
 
 
+def test_nothing_is_said_of_checkpoints_that_are_gone(run_dir):
+    with CheckpointStore(run_dir, keep=2) as store:
+        store.save(1, {"tree": TREE}, {}, None)
+        store._wait()
+        shutil.rmtree(run_dir)
+        said = refused(store.save, 2, {"tree": TREE}, {}, None)
+        assert said.endswith("a checkpoint could not be written: No such file or directory")
+
+
 def test_a_long_reason_keeps_its_beginning_and_its_end(run_dir, monkeypatch):
     def fail(*arguments, **keywords):
         # Some releases of TensorStore add where in their source they noticed.
