@@ -16,7 +16,7 @@ from jetbot_mjx import deployment, evaluation, runs, training, tuning, viewers
 from jetbot_mjx.config import Config, Overrides, load_config
 from jetbot_mjx.devices import require_device
 from jetbot_mjx.errors import InvalidError, UserError, check_count, check_size, ran_out
-from jetbot_mjx.runs import default_run_dir, find_run, find_run_config, seed_folders, trusting
+from jetbot_mjx.runs import claim_run_dir, find_run, find_run_config, seed_folders, trusting
 from jetbot_mjx.terminal import restart_clock, show_progress
 
 if TYPE_CHECKING:
@@ -83,9 +83,10 @@ def train(
             run_dir = find_run(resume)
             config = find_run_config(run_dir)
         assert config is not None
-        run_dir = default_run_dir(_name(config)) if run_dir is None else Path(run_dir)
         restart_clock()
-        return training.run(load_config(config, overrides), run_dir, verbose=verbose)
+        checked = load_config(config, overrides)
+        with claim_run_dir(run_dir, _name(config)) as folder:
+            return training.run(checked, folder, verbose=verbose)
 
 
 @overload
@@ -266,8 +267,8 @@ def tune(
         check_count("confirm", confirm)
     base = load_config(config, overrides)
     parameters = tuning.read_space(space, base)
-    folder = default_run_dir(Path(f"tune-{_name(config).stem}")) if output is None else Path(output)
-    with _ready(verbose):
+    name = Path(f"tune-{_name(config).stem}")
+    with _ready(verbose), claim_run_dir(output, name) as folder:
         return tuning.run_search(
             base,
             parameters,

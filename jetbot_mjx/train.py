@@ -39,14 +39,14 @@ def _parser() -> cli.Parser:
     return parser
 
 
-def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
+def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path | None]":
+    """Return the configuration, and the run folder if one is named."""
     with startup.exit_on_interrupt():
-        from jetbot_mjx.runs import default_run_dir, find_run, find_run_config
+        from jetbot_mjx.runs import find_run, find_run_config
+    run_dir = options.run_dir
     if options.resume:
         run_dir = find_run(options.resume, say=cli.note)
         options.config = find_run_config(run_dir)
-    else:
-        run_dir = options.run_dir or default_run_dir(options.config)
     given = {"seed": options.seed, "seeds": options.seeds, "init_from": options.init_from}
     overrides = [f"{key}={json.dumps(x)}" for key, x in given.items() if x is not None]
     return cli.config_of(options, *overrides), run_dir
@@ -90,7 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with startup.exit_on_interrupt():
         from jetbot_mjx.training import Preemption, run
     stop = Preemption(config.preemption_notice)
-    with cli.trusting(options.trust):
+    folder = runs.claim_run_dir(run_dir, options.config, creates=is_primary())
+    with cli.trusting(options.trust), folder as run_dir:
         result = run(config, run_dir, programs, stop, verbose=True)
     if is_primary():
         text = training.closing_message(result)

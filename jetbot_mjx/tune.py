@@ -43,13 +43,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     config = cli.config_of(options)
     startup.wake_device()
     with startup.exit_on_interrupt():
-        from jetbot_mjx.runs import default_run_dir
+        from jetbot_mjx.runs import claim_run_dir
         from jetbot_mjx.terminal import process_seconds
         from jetbot_mjx.tuning import CONFIRM_SEEDS, entrants_table, read_space, run_search
     space = read_space(options.space, config)
     cli.prepare_device()
-    folder = options.output or default_run_dir(Path(f"tune-{options.config.stem}"))
-    with cli.show_progress():
+    name = Path(f"tune-{options.config.stem}")
+    with cli.show_progress(), claim_run_dir(options.output, name) as folder:
         found = run_search(
             config,
             space,

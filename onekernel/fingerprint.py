@@ -129,6 +129,8 @@ class _Hasher:
         for variable in (*jaxpr.constvars, *jaxpr.invars):
             self._atom(variable)
         for equation in jaxpr.eqns:
+            if equation.effects:  # such as printing, by a call of Python
+                raise _UnknownError(equation)
             self._word(equation.primitive.name)
             for atom in (*equation.invars, *equation.outvars):
                 self._atom(atom)

@@ -32,6 +32,7 @@ from .task_modules import class_name as class_name
 from .task_modules import find_task_here as find_task_here
 from .task_modules import import_root as import_root
 from .task_modules import is_task_here as is_task_here
+from .task_modules import read_sources as read_sources
 from .task_modules import source_file as source_file
 from .value_types import NonNegative as NonNegative
 from .value_types import Positive as Positive

@@ -31,7 +31,7 @@ from jetbot_mjx.envs.kernel_impl import KernelImpl
 from jetbot_mjx.envs.own_class import import_class
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.task import Field, Layout
-from jetbot_mjx.errors import InvalidError, UserError
+from jetbot_mjx.errors import InvalidError, UserError, shown
 from jetbot_mjx.mjx_import import Env
 
 
@@ -122,8 +122,9 @@ class AdaptedEnv(Env):
 
         def reset(rng: Array) -> Outcome:
             outcome = one.reset(rng)
+            words = _with_words(outcome)
             kinds.append(jax.tree.map(_kind, outcome.kept))
-            return _with_words(outcome)
+            return words
 
         def step(words: PyTree, action: Array) -> Outcome:
             kept = jax.tree.map(_from_words, kinds[0], words)
@@ -350,12 +351,22 @@ def _read_leaves(step: ClosedJaxpr, count: int) -> list[bool]:
 
 
 def _with_words(outcome: Outcome) -> Outcome:
-    return outcome._replace(kept=jax.tree.map(_as_words, outcome.kept))
+    return outcome._replace(kept=jax.tree_util.tree_map_with_path(_as_words, outcome.kept))
 
 
-def _as_words(x: Any) -> Array:
-    """Return an array, or the words of random keys."""
-    array = jnp.asarray(x)
+def _as_words(path: jax.tree_util.KeyPath, x: Any) -> Array:
+    """Return an array, or the words of random keys.
+
+    Raises:
+      InvalidError: it is neither.
+    """
+    try:
+        array = jnp.asarray(x)
+    except (TypeError, ValueError):
+        name = jax.tree_util.keystr(path).lstrip(".")
+        raise InvalidError(
+            f"the state's {name} = {shown(x)} is wrong: it should be a number or an array"
+        ) from None
     # Without a weak type, which a number of Python has at first, and no step's result.
     return jax.random.key_data(array) if _is_key(array.dtype) else array.astype(array.dtype)
 

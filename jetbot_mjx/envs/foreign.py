@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt32
 
-from jetbot_mjx.errors import InvalidError
+from jetbot_mjx.errors import InvalidError, shown
 
 SUCCESS = "success"
 """Name of the metric that is 1 in a step that solves the task."""
@@ -108,7 +108,7 @@ def _brax(env: Any) -> Foreign:
     if size is None and (model := getattr(env, "mj_model", None)) is not None:
         size = model.nu
     if not isinstance(size, int | np.integer) or size < 1:
-        raise InvalidError(f"action_size = {size!r} is wrong: it should be a whole number")
+        raise InvalidError(f"action_size = {size!r} is wrong: it should be a whole number above 0")
     return Foreign(
         lambda rng: outcome(env.reset(rng)),
         lambda state, action: outcome(env.step(state, action)),
@@ -173,8 +173,10 @@ def _scalar(name: str, x: Any) -> Float[Array, ""]:
     """Return a number as float32.
 
     Raises:
-      InvalidError: it has axes.
+      InvalidError: it has axes, or is no number.
     """
+    if x is None or isinstance(x, str):
+        raise InvalidError(f"{name} = {shown(x)} is wrong: it should be one number")
     if jnp.shape(x) != ():
         raise InvalidError(
             f"{name} has the shape {list(jnp.shape(x))}: it should be one number, of one instance"

@@ -3,10 +3,13 @@
 import difflib
 import importlib
 import os
+import sys
+from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from jetbot_mjx.config import find_task_here
+from jetbot_mjx.config import find_task_here, read_sources
 from jetbot_mjx.envs.checks.errors import describe_error
 from jetbot_mjx.errors import InvalidError, MissingPackageError, UserError
 
@@ -24,7 +27,7 @@ def import_class(key: str, name: str) -> Any:
     module_name, _, class_name = name.partition(":")
     find_task_here(module_name)
     try:
-        module = importlib.import_module(module_name)
+        module = _import_as_it_is(module_name)
     except ModuleNotFoundError as error:
         if f"{module_name}.".startswith(f"{error.name}."):
             here = sorted(path.stem for path in Path().glob("*.py"))
@@ -56,3 +59,22 @@ def import_class(key: str, name: str) -> Any:
             raise InvalidError(f"{key} = {name!r}: {owner} has no {part!r}{hint}")
         found, owner = getattr(found, part), part
     return found
+
+
+_imported: dict[str, Mapping[str, bytes]] = {}
+"""The files that each module was imported from, with those of its imports, by its name."""
+
+
+def _import_as_it_is(name: str) -> ModuleType:
+    """Import a module of one's own; again, if a file was edited since, as in a notebook."""
+    sources = read_sources(name)
+    files = {} if sources is None else sources.files
+    earlier = _imported.get(name, files)
+    if earlier != files:
+        for path in {*earlier, *files}:
+            module = path.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
+            sys.modules.pop(module, None)
+        importlib.invalidate_caches()
+    module = importlib.import_module(name)
+    _imported[name] = files
+    return module

@@ -163,7 +163,7 @@ class EpisodeWrapper(Wrapper):
             "steps": zero,
             "truncation": zero,
             "episode_done": zero,
-            "episode_metrics": {"sum_reward": zero, "length": zero, **dict.fromkeys(metrics, zero)},
+            "episode_metrics": {**dict.fromkeys(metrics, zero), "sum_reward": zero, "length": zero},
             "final_obs": state.obs,
         }
         return state.replace(metrics=metrics, info=info)
@@ -193,7 +193,8 @@ class EpisodeWrapper(Wrapper):
 
         # Add the step to the sums of the episode.
         metrics = {**nstate.metrics, "nonfinite_envs": 1.0 - finite.astype(jnp.float32)}
-        step_values = {"sum_reward": nstate.reward, "length": length, **metrics}
+        # An environment of one's own may have metrics of these names.
+        step_values = {**metrics, "sum_reward": nstate.reward, "length": length}
         sums = {
             name: jnp.where(begins, 0.0, total) + step_values[name]
             for name, total in state.info["episode_metrics"].items()

@@ -44,7 +44,7 @@ from .run_dir import JsonObject as JsonObject
 from .run_dir import atomic_folder as atomic_folder
 from .run_dir import changed_versions as changed_versions
 from .run_dir import check_writable as check_writable
-from .run_dir import default_run_dir as default_run_dir
+from .run_dir import claim_run_dir as claim_run_dir
 from .run_dir import make_folder as make_folder
 from .run_dir import occupied as occupied
 from .run_dir import read_text as read_text

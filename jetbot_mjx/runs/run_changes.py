@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from jetbot_mjx.errors import NotFoundError, UserError, os_errors
-from jetbot_mjx.runs.run_dir import CONFIG, occupied, read_config
+from jetbot_mjx.runs.run_dir import CONFIG, occupied, read_config, seed_folders
 from jetbot_mjx.runs.run_finder import (
     PRETRAINED,
     ROOT,
@@ -110,12 +110,13 @@ def changes_since_the_run_before(run_dir: Path) -> RunChanges | None:
 
 
 def newest_report(run: Path) -> Path:
-    """Return the page of the newest report of a run.
+    """Return the page of the newest report of a run, which of several seeds is a comparison.
 
     Raises:
       NotFoundError: there is none.
     """
-    pages = run.glob("evaluations/*/report.html")
+    name = "comparison" if seed_folders(run) else "report"
+    pages = run.glob(f"evaluations/*/{name}.html")
     newest = max(pages, key=lambda page: page.stat().st_mtime, default=None)
     if newest is None:
         raise NotFoundError(f"{run} has no report: write one with `jetbot-mjx evaluate {run}`")

@@ -9,6 +9,7 @@ for each of them, with all of that inside.
 import contextlib
 import datetime
 import errno
+import itertools
 import json
 import os
 import platform
@@ -71,9 +72,49 @@ class DamagedRunError(UserError):
 
 
 def default_run_dir(config_path: Path, root: Path = Path("runs")) -> Path:
-    """Return `runs/<config>-<date>-<time>`, in local time."""
+    """Return `runs/<config>-<date>-<time>`, in local time, which may exist."""
     now = datetime.datetime.now().astimezone()
     return root / f"{config_path.stem}-{now:%Y%m%d-%H%M%S}"
+
+
+@contextlib.contextmanager
+def claim_run_dir(
+    given: str | Path | None,
+    config_path: Path,
+    root: Path = Path("runs"),
+    *,
+    creates: bool = True,
+) -> Iterator[Path]:
+    """Yield the run folder that is given, or create the default one.
+
+    A number is appended to the default one's name if another training, here or elsewhere, has taken
+    it in this second. If nothing is written into it, it is removed again.
+
+    Args:
+      given: the folder; None: the default one.
+      config_path: the configuration whose name the default one has.
+      root: the folder of runs.
+      creates: whether to create it, as the first of several processes does.
+
+    Raises:
+      UserError: the folder cannot be created.
+    """
+    first = default_run_dir(config_path, root)
+    if given is not None or not creates:
+        yield first if given is None else Path(given)
+        return
+    for count in itertools.count(1):
+        run_dir = first.with_name(f"{first.name}-{count}") if count > 1 else first
+        with writing_to(run_dir), contextlib.suppress(FileExistsError):
+            make_folders(root)
+            run_dir.mkdir()
+            break
+    try:
+        yield run_dir
+    finally:
+        for folder in (run_dir, root):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
 
 def seed_dirs(run_dir: Path, config: Config) -> list[Path]:

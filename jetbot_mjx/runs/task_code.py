@@ -12,7 +12,6 @@ different sources of one name can be used in one process. So the modules must im
 they are imported, not later in a function.
 """
 
-import ast
 import contextlib
 import hashlib
 import importlib
@@ -32,7 +31,7 @@ from jetbot_mjx.config import (
     find_task_here,
     import_root,
     is_task_here,
-    shipped_folder,
+    read_sources,
     source_file,
 )
 from jetbot_mjx.errors import UserError
@@ -81,32 +80,11 @@ def collect_task_code(name: str) -> TaskCode | None:
     """
     module = name.partition(":")[0]
     find_task_here(module)
-    root = import_root(module)
-    if root is None or _is_installed(root, module):
-        return None
-    files: dict[str, bytes] = {}
-    late: list[str] = []
-    names, seen = [module], set()
-    # Follow the imports, the parent packages included.
-    while names:
-        one = names.pop()
-        if one in seen or import_root(one) != root or _is_installed(root, one):
-            continue
-        seen.add(one)
-        parent = one.rpartition(".")[0]
-        names += [parent] if parent else []
-        file = source_file(root, one)
-        if file is None:
-            continue
-        content = file.read_bytes()
-        files[file.relative_to(root).as_posix()] = content
-        for other, line, is_late in _imports(content, one if file.stem == "__init__" else parent):
-            names.append(other)
-            if is_late and source_file(root, other) and import_root(other) == root:
-                late.append(f"{shortened(file)}, line {line}: imports {other} inside a function")
+    sources = read_sources(module)
     # Store all of them, or nothing.
-    if source_file(root, module) is None:
+    if sources is None:
         return None
+    files, late = sources
     if sum(map(len, files.values())) > MAX_BYTES:
         _say(
             f"the source of {name} is larger than {MAX_BYTES:,} bytes and is not stored in the run"
@@ -206,11 +184,8 @@ def stored_class(run_dir: Path, name: str, code: TaskCode, *, silent: bool = Fal
     is_here = is_task_here(module)
     place = Path.cwd() if is_here else import_root(module)
     on_disk = place is not None and source_file(place, module) is not None
-    is_same = (
-        place is not None
-        and on_disk
-        and all(holds(place / path, text) for path, text in code.files)
-    )
+    changed = [path for path, text in code.files if place and not holds(place / path, text)]
+    is_same = on_disk and not changed
     if is_same and not is_here:
         return None
     # Import the stored files.
@@ -221,7 +196,7 @@ def stored_class(run_dir: Path, name: str, code: TaskCode, *, silent: bool = Fal
     if silent or is_same:
         pass
     elif on_disk:
-        reason = f"{module} on disk differs from the code this run was trained with: using the"
+        reason = f"{changed[0]} on disk differs from the code this run was trained with: using the"
         _say(f"{reason} stored code {shortened(main)}", code)
     else:
         _say(f"running the code stored in {shortened(main)}", code)
@@ -234,47 +209,6 @@ def stored_class(run_dir: Path, name: str, code: TaskCode, *, silent: bool = Fal
     if not hasattr(found, class_name):
         raise UserError(f"{shortened(main)} has no {class_name!r}, which {name!r} names")
     return getattr(found, class_name)
-
-
-def _is_installed(root: Path, module: str) -> bool:
-    top = module.partition(".")[0]
-    if top == _PACKAGE or top in sys.stdlib_module_names:
-        return True
-    # The examples are installed with this package, but imported only where they are asked for.
-    is_example = root == shipped_folder("examples").resolve()
-    return bool({"site-packages", "dist-packages"} & {*root.parts}) and not is_example
-
-
-def _imports(source: bytes, package: str) -> list[tuple[str, int, bool]]:
-    """Find all that a source file may import, wherever it does.
-
-    Args:
-      source: the content of the file.
-      package: the package that relative imports start from.
-
-    Returns:
-      Full name of each import, its line, and whether it is made inside a function.
-    """
-    try:
-        tree = ast.parse(source)
-    except (SyntaxError, ValueError):
-        return []
-    functions = ast.FunctionDef | ast.AsyncFunctionDef
-    late = {x for node in ast.walk(tree) if isinstance(node, functions) for x in ast.walk(node)}
-    found = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                with contextlib.suppress(ImportError):
-                    base = importlib.util.resolve_name("." * node.level + base, package)
-            names = [base, *(f"{base}.{alias.name}" for alias in node.names)] if base else []
-        else:
-            continue
-        found += [(name, node.lineno, node in late) for name in names]
-    return found
 
 
 def holds(path: Path, content: bytes) -> bool:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import time
 import webbrowser
 from pathlib import Path
@@ -61,6 +62,20 @@ def test_the_newest_report_is_opened(runs, monkeypatch, capsys):
     assert list_runs.main(["--open", "latest"]) == 0
     assert opened == [page.resolve().as_uri()]
     assert "no browser was found" in capsys.readouterr().out
+
+
+def test_of_several_seeds_their_comparison_is_opened(runs, monkeypatch):
+    make_run(Path("runs/both/seed-0"), (0, 10.0, 0.1))
+    shutil.copy("runs/both/seed-0/config.yaml", "runs/both/config.yaml")
+    opened = []
+    monkeypatch.setattr(webbrowser, "open", lambda url: bool(opened.append(url)))
+    page = Path("runs/both/evaluations/comparison/comparison.html")
+    with pytest.raises(UserError, match="runs/both has no report"):
+        list_runs.main(["--open", "both"])
+    page.parent.mkdir(parents=True)
+    page.write_text("")
+    assert list_runs.main(["--open", "both"]) == 0
+    assert opened == [page.resolve().as_uri()]
 
 
 def test_two_runs_are_compared_by_name(runs, capsys):

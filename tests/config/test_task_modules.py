@@ -12,7 +12,6 @@ from jetbot_mjx import new_task
 from jetbot_mjx.config import load_config, parse_config, shipped_configs, task_modules
 from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs import task_code
 from jetbot_mjx.runs.task_code import collect_task_code, stored_class, write_task_code
 
 TASK = """
@@ -166,7 +165,7 @@ def test_an_example_in_an_installed_package_is_stored_in_its_run(tmp_path, root,
     monkeypatch.delitem(sys.modules, "gates_task", raising=False)
     monkeypatch.setattr(task_modules, "TASK_FOLDERS", {})
     monkeypatch.setattr(sys, "path", [one for one in sys.path if Path(one).name != "examples"])
-    monkeypatch.setattr(task_code, "shipped_folder", lambda name: examples)
+    monkeypatch.setattr(task_modules, "shipped_folder", lambda name: examples)
     config = load_config(examples / "gates.yaml")
     code = collect_task_code(config.task.name)
     assert code is not None

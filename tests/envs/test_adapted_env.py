@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.own_environments import Lever, NoisyPoint, OwnState, adapted
+from helpers.own_environments import ZERO, Lever, NoisyPoint, OwnState, adapted
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.adapted_env import AdaptedEnv
 from jetbot_mjx.envs.wrappers import wrap_for_training
@@ -151,6 +151,33 @@ def test_numbers_of_python_and_numpy_become_arrays_of_jax():
     assert [float(state.done) for state in states] == [0, 0, 0, 0, 1]
     dtypes = {leaf.dtype.name for leaf in jax.tree.leaves(states[-1])}
     assert dtypes == {"float32", "int32", "uint32"}
+
+
+def test_a_state_with_what_is_no_number_is_refused_by_its_name():
+    class Named(Lever):
+        def reset(self, rng):
+            return super().reset(rng).replace(info={"kind": "walk", "none": None})
+
+    with pytest.raises(UserError, match=r"the state's info\['kind'\] = 'walk' is wrong: it should"):
+        adapted(Named)
+
+
+@pytest.mark.parametrize("name", ["length", "sum_reward"])
+def test_a_metric_takes_no_place_among_the_sums_of_an_episode(name):
+    class Measured(Lever):
+        def reset(self, rng):
+            return super().reset(rng).replace(metrics={name: ZERO})
+
+        def step(self, state, action):
+            return super().step(state, action).replace(metrics={name: ZERO - 7})
+
+    plain, measured = (
+        drive(wrap_for_training(adapted(one), 8), [[[1.0, 0.0]]] * 2, KEY[None])[-1]
+        for one in (Lever, Measured)
+    )
+    sums = measured.info["episode_metrics"]
+    assert float(sums["length"][0]) == 2
+    assert float(sums["sum_reward"][0]) == float(plain.info["episode_metrics"]["sum_reward"][0])
 
 
 def test_a_step_that_changes_the_state_is_refused():

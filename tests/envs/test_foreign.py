@@ -109,9 +109,17 @@ def test_what_is_no_environment_is_refused(source, told):
         ({"done": jnp.zeros((1, 1))}, r"done has the shape \[1, 1\]"),
         ({"metrics": {"speed": jnp.zeros(2)}}, r"metrics\['speed'\] has the shape \[2\]"),
         ({"info": {"truncation": jnp.zeros(2)}}, r'info\["truncation"\] has the shape'),
+        (
+            {"metrics": {"kind": "walk"}},
+            r"metrics\['kind'\] = 'walk' is wrong: it should be one num",
+        ),
+        (
+            {"metrics": {"speed": None}},
+            r"metrics\['speed'\] = None is wrong: it should be one number",
+        ),
     ],
 )
-def test_a_result_of_the_wrong_shape_is_refused(state, told):
+def test_a_result_of_the_wrong_shape_or_kind_is_refused(state, told):
     with pytest.raises(InvalidError, match=told):
         as_foreign(brax(**state)).reset(KEY)
 

@@ -92,3 +92,12 @@ def test_a_call_of_python_has_no_hash():
         return jax.pure_callback(lambda x: 2 * x, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
 
     assert hashed(calls) is None
+
+
+@pytest.mark.parametrize("wrapped", [lambda function: function, jax.jit])
+def test_what_prints_has_no_hash_for_its_program_cannot_be_stored(wrapped):
+    def prints(x):
+        jax.debug.print("x = {}", x)
+        return x
+
+    assert hashed(wrapped(prints)) is None

@@ -19,6 +19,7 @@ from jetbot_mjx.runs.run_dir import (
     DamagedRunError,
     atomic_folder,
     changed_versions,
+    claim_run_dir,
     make_folder,
     occupied,
     read_config,
@@ -321,3 +322,34 @@ def test_a_runs_model_is_written_before_the_configuration_that_names_it(tmp_path
     with pytest.raises(ZeroDivisionError):
         run_dir.write_run(tmp_path, config, {})
     assert (tmp_path / "robot" / "rover.xml").is_file()
+
+
+def test_trainings_that_begin_in_one_second_have_a_folder_each(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_dir, "default_run_dir", lambda config, root: root / "own-now")
+    root = tmp_path / "runs"
+    with (
+        claim_run_dir(None, Path("own.yaml"), root) as first,
+        claim_run_dir(None, Path("own.yaml"), root) as second,
+    ):
+        assert [first, second] == [root / "own-now", root / "own-now-2"]
+        assert stored_config(second) is None
+        (first / "config.yaml").write_text("seed: 0\n")
+    assert [path.name for path in root.iterdir()] == ["own-now"]
+
+
+def test_a_training_that_fails_at_once_leaves_no_folder(tmp_path):
+    with (
+        pytest.raises(UserError, match="wrong"),
+        claim_run_dir(None, Path("own.yaml"), tmp_path / "runs"),
+    ):
+        raise UserError("wrong")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_in_the_place_of_all_runs_is_told(tmp_path):
+    (tmp_path / "runs").write_text("")
+    with (
+        pytest.raises(UserError, match=r"runs/own-[0-9-]* cannot be written: "),
+        claim_run_dir(None, Path("own.yaml"), tmp_path / "runs"),
+    ):
+        pass
