@@ -153,8 +153,8 @@ class AdaptedEnv(Env):
         self._step_traced = _Traced(step_jaxpr, wanted)
         self.metrics = tuple(shown.metrics)
         """The names of the environment's metrics."""
-        self.layout: Layout = (Field("observation", shown.obs.shape[0], "", ""),)
-        """The observation, whose units are not known."""
+        self.layout: Layout = tuple(Field(name, size, "", "") for name, size in one.parts.items())
+        """The parts of the observation, whose units are not known."""
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
         """Begin an episode.
@@ -238,7 +238,7 @@ class AdaptedEnv(Env):
     @property
     def observation_size(self) -> int:
         """Length of the observation."""
-        return self.layout[0].size
+        return sum(field.size for field in self.layout)
 
     @property
     def action_size(self) -> int:

@@ -46,6 +46,8 @@ class Foreign(NamedTuple):
     action_size: int
     is_discrete: bool
     """Whether an action is the choice of one of `action_size`."""
+    parts: Mapping[str, int]
+    """Sizes of the parts of an observation by name, in their order, once `reset` was traced."""
 
 
 def as_foreign(source: Any) -> Foreign:
@@ -77,6 +79,8 @@ def as_foreign(source: Any) -> Foreign:
 
 
 def _brax(env: Any) -> Foreign:
+    parts: dict[str, int] = {}
+
     def outcome(state: Any) -> Outcome:
         if state is None or type(state) in (tuple, list):
             what = "nothing" if state is None else f"a {type(state).__name__}"
@@ -97,7 +101,7 @@ def _brax(env: Any) -> Foreign:
             terminated = done * (1.0 - _scalar('info["truncation"]', info["truncation"]))
         return Outcome(
             state,
-            _vector(state.obs),
+            _vector(state.obs, parts),
             _scalar("reward", state.reward),
             jnp.maximum(done, terminated),
             terminated,
@@ -114,10 +118,12 @@ def _brax(env: Any) -> Foreign:
         lambda state, action: outcome(env.step(state, action)),
         int(size),
         is_discrete=bool(getattr(env, "discrete_actions", False)),
+        parts=parts,
     )
 
 
 def _gymnax(env: Any, params: Any) -> Foreign:
+    parts: dict[str, int] = {}
     # Gymnax counts the time limit among the ends; the trainer has its own, which it tells apart.
     if hasattr(params, "max_steps_in_episode"):
         params = params.replace(max_steps_in_episode=np.iinfo(np.int32).max)
@@ -126,7 +132,7 @@ def _gymnax(env: Any, params: Any) -> Foreign:
 
     def outcome(key: Array, state: Any, obs: Any, reward: Any, done: Any) -> Outcome:
         done = _scalar("done", done)
-        return Outcome((key, state), _vector(obs), _scalar("reward", reward), done, done, {})
+        return Outcome((key, state), _vector(obs, parts), _scalar("reward", reward), done, done, {})
 
     def reset(rng: Array) -> Outcome:
         key, own_key = jax.random.split(rng)
@@ -143,11 +149,15 @@ def _gymnax(env: Any, params: Any) -> Foreign:
         return outcome(key, state, obs, reward, done)
 
     size = space.n if is_discrete else int(np.prod(space.shape))
-    return Foreign(reset, step, int(size), is_discrete)
+    return Foreign(reset, step, int(size), is_discrete, parts)
 
 
-def _vector(obs: PyTree) -> Float[Array, " obs"]:
+def _vector(obs: PyTree, sizes: dict[str, int]) -> Float[Array, " obs"]:
     """Return an observation as one vector; the parts of a dictionary are joined in their order.
+
+    Args:
+      obs: the observation.
+      sizes: receives the size of each part by its name.
 
     Raises:
       InvalidError: a part is no vector.
@@ -155,7 +165,7 @@ def _vector(obs: PyTree) -> Float[Array, " obs"]:
     if isinstance(obs, Mapping):
         # What a robot cannot know is for a critic that sees more, which this PPO does not have.
         obs = {name: x for name, x in obs.items() if not str(name).startswith(_PRIVILEGED)}
-    parts = []
+    parts = {}
     for path, x in jax.tree_util.tree_leaves_with_path(obs):
         if jnp.ndim(x) > 1:
             name = f"observation{jax.tree_util.keystr(path)}"
@@ -163,10 +173,12 @@ def _vector(obs: PyTree) -> Float[Array, " obs"]:
                 f"{name} has the shape {list(jnp.shape(x))}: it should be a vector, such as"
                 " x.ravel()"
             )
-        parts.append(jnp.atleast_1d(jnp.asarray(x, jnp.float32)))
-    if not sum(x.size for x in parts):
+        name = jax.tree_util.keystr(path, simple=True, separator=".") or "observation"
+        parts[name] = jnp.atleast_1d(jnp.asarray(x, jnp.float32))
+    sizes.update({name: x.size for name, x in parts.items() if x.size})
+    if not sizes:
         raise InvalidError("observation is empty: it should be a vector")
-    return jnp.concatenate(parts)
+    return jnp.concatenate([*parts.values()])
 
 
 def _scalar(name: str, x: Any) -> Float[Array, ""]:

@@ -137,4 +137,6 @@ def test_success_in_info_becomes_a_metric():
 
 def test_parts_of_an_observation_are_joined_in_the_order_of_their_names():
     parts = {"b": {"y": jnp.array([2.0]), "x": 1.0}, "a": jnp.array([0, 5]), "privileged_b": 9.0}
-    np.testing.assert_array_equal(as_foreign(brax(obs=parts)).reset(KEY).obs, [0, 5, 1, 2])
+    env = as_foreign(brax(obs=parts))
+    np.testing.assert_array_equal(env.reset(KEY).obs, [0, 5, 1, 2])
+    assert list(env.parts.items()) == [("a", 2), ("b.x", 1), ("b.y", 1)]
