@@ -20,7 +20,7 @@ def test_configurations_are_found_by_name(tmp_path, monkeypatch):
     [
         ("jetbot_egocentrc", "did you mean jetbot_egocentric?"),
         ("configs/smokee.yaml", "did you mean smoke?"),
-        ("xyz", "give a file, or one of best, best_egocentric,"),
+        ("xyz", "give a file, or one of best, best_camera, best_egocentric,"),
     ],
 )
 def test_a_mistaken_configuration_is_told_the_likely_one(tmp_path, monkeypatch, name, told):

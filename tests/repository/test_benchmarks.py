@@ -21,7 +21,7 @@ from benchmarks import RESULTS, ROOT, steps_per_second
 from benchmarks.harness import processes, readme_table, results, timing
 from benchmarks.harness.measurements import Sizes
 from benchmarks.harness.timing import make_row
-from benchmarks.learning import randomization, seeds
+from benchmarks.learning import randomization, search_floor, seeds
 from benchmarks.reliability import regressions, robot_fidelity
 from benchmarks.throughput import (
     adapters,
@@ -206,6 +206,34 @@ def test_the_variants_of_a_benchmark_are_valid_settings(tmp_path):
     wrong.write_text("name: 3\n")
     with pytest.raises(UserError, match="should hold a mapping of changed settings"):
         seeds.variants_of(wrong)
+
+
+def test_a_search_costs_the_longer_turn_to_half_of_the_goals_out_of_view():
+    # Ahead, and at 90° and 150° of which either side is one of the two.
+    goals = np.array([[1.0, 0.0], [0.0, -1.0], [-np.sqrt(3.0), 1.0]])
+    seconds = np.array([1.0, 1.0, 2.0])
+    found = search_floor.search_floor(goals, seconds, np.pi / 4, np.pi)
+    # The longer turns are 180° and 60° more, at 180°/s.
+    np.testing.assert_allclose(found, (2 / 3, (1 + 1 / 3) / 2, 0.5 * (1 + 1 / 3) / 4), rtol=1e-6)
+    assert search_floor.search_floor(goals[:1], seconds[:1], np.pi / 4, np.pi) == (0.0, 0.0, 0.0)
+
+
+def test_the_view_to_each_side_follows_from_the_shape_of_the_image():
+    camera = parse_config({"camera": {"fovy": 90.0, "width": 64, "height": 32}}).camera
+    assert search_floor.half_view(camera) == pytest.approx(np.arctan(2.0))
+    lens = parse_config({"camera": {"lens": "fisheye"}}).camera
+    with pytest.raises(UserError, match="lens = fisheye: the estimate is for a pinhole"):
+        search_floor.half_view(lens)
+
+
+def test_the_search_from_the_shipped_camera_costs_what_the_page_says(capsys):
+    assert search_floor.main([]) == 0
+    printed = capsys.readouterr().out
+    page = (ROOT / "docs/best.md").read_text()
+    for figure in re.findall(r"[+]?[\d.]+ ?[%s]", printed):
+        assert figure.lstrip("+").replace("%", " %") in page
+    with pytest.raises(UserError, match="no best-known times for these settings"):
+        search_floor.main(["--config", "camera_real"])
 
 
 def test_the_table_holds_the_median_time_and_the_worst_success_of_all_seeds():
