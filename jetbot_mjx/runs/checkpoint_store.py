@@ -181,7 +181,9 @@ class CheckpointStore(contextlib.AbstractContextManager["CheckpointStore"]):
         # Write under a temporary name, and rename what the disk holds.
         unfinished = path.with_name(_HIDDEN.format(path.name))
         try:
-            (unfinished / _ABOUT).mkdir(parents=True)
+            # Without its parents: a run folder that was moved away is not made again.
+            unfinished.mkdir()
+            (unfinished / _ABOUT).mkdir()
             (unfinished / _ABOUT / "metadata").write_text(json.dumps(about))
             for name, tree in trees.items():
                 write_arrays(unfinished / name, _join(tree) if name in joined else tree)
@@ -382,7 +384,8 @@ def digest(tree: PyTree) -> str:
     for name, leaf in sorted(flatten(tree).items()):
         array = np.ascontiguousarray(leaf)
         total.update(f"{name} {array.dtype.str} {np.shape(leaf)}\n".encode())
-        total.update(array.data)
+        # Arrays of bfloat16 have no buffer of their own type.
+        total.update(array.reshape(-1).view(np.uint8).data)
     return total.hexdigest()
 
 

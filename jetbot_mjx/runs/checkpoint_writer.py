@@ -8,15 +8,10 @@ from typing import Any
 import numpy as np
 import tensorstore as ts
 
-_CONTEXT = ts.Context(
-    {
-        # Two threads are enough for one checkpoint at a time, and leave the others to the training.
-        "data_copy_concurrency": {"limit": 2},
-        "file_io_concurrency": {"limit": 2},
-        # The caller syncs all files at once.
-        "file_io_sync": False,
-    }
-)
+_CONTEXT = {
+    # Two threads are enough for one checkpoint at a time, and leave the others to the training.
+    "data_copy_concurrency": {"limit": 2},
+}
 
 
 def write_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -29,11 +24,13 @@ def write_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
     Raises:
       Exception: TensorStore could not write them; it raises many kinds.
     """
-    folder.mkdir()
-    files = key_value_store(folder)
+    key_value_store(folder)  # refuses a folder that nothing could be read from
+    # TensorStore writes into memory: where a drive fails, some of its commits never end.
+    memory: dict[str, Any] = {"driver": "memory"}
+    context = ts.Context(_CONTEXT)
     with ts.Transaction() as transaction:
         for name, array in arrays.items():
-            place = {**files, "path": f"{name}/"}
+            place = {"driver": "ocdbt", "base": memory, "path": f"{name}/"}
             store = ts.open(
                 {"driver": "zarr", "kvstore": place, "store_data_equal_to_fill_value": True},
                 create=True,
@@ -41,9 +38,15 @@ def write_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
                 shape=array.shape,
                 chunk_layout=ts.ChunkLayout(chunk_shape=[max(1, size) for size in array.shape]),
                 transaction=transaction,
-                context=_CONTEXT,
+                context=context,
             ).result()
             store.write(array).result()
+    files = ts.KvStore.open(memory, context=context).result()
+    folder.mkdir()
+    for key in files.list().result():
+        file = folder / key.decode()
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(files.read(key).result().value)
     (folder / "_METADATA").write_text(json.dumps(_metadata(arrays)))
 
 

@@ -3,6 +3,7 @@
 import json
 import os
 
+import numpy as np
 import pytest
 
 from benchmarks import RESULTS
@@ -10,6 +11,13 @@ from benchmarks.harness.faulty_drive import FaultyDrive, why_not
 from benchmarks.reliability import network_drive, torture
 from benchmarks.reliability.network_drive import Ground
 from helpers import gliding
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.checkpoint_store import (
+    CheckpointStore,
+    checkpoint_path,
+    checkpoint_steps,
+    read_tree,
+)
 
 mounted = pytest.mark.skipif(bool(why_not()), reason=why_not())
 
@@ -56,6 +64,29 @@ def test_a_drive_does_what_it_is_told(tmp_path):
         counts = drive.set()
         assert 0 < counts["faults"] < counts["calls"]
     assert not mount.is_mount()
+
+
+@mounted
+def test_a_save_on_a_drive_that_fails_comes_to_its_end(tmp_path):
+    files, mount = tmp_path / "files", tmp_path / "drive"
+    files.mkdir()
+    mount.mkdir()
+    tree, refused = {"weights": np.linspace(0, 1, 20_000), "count": np.uint32(7)}, 0
+    errors = (*network_drive.ERRORS, "ENOSPC", "EROFS", "EINTR")
+    with FaultyDrive(files, mount) as drive:
+        for step, error in enumerate(10 * errors, 1):
+            try:
+                with CheckpointStore(mount, keep=5) as store:
+                    drive.set(0.1, error)
+                    store.save(step, {"arrays": tree, "joined": tree}, {}, None, ["joined"])
+            except UserError:
+                refused += 1
+            drive.set()
+        for step in (left := checkpoint_steps(mount)):
+            for name in ("arrays", "joined"):
+                read_tree(checkpoint_path(mount, step), name, tree)
+    assert left
+    assert refused > 10
 
 
 def test_nothing_was_lost_when_it_was_measured():

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
@@ -33,6 +34,7 @@ TREE = {
     "weights": np.linspace(-1, 1, 6, dtype=np.float32).reshape(2, 3),
     "count": np.uint32(7),
     "done": np.array([True, False]),
+    "half": jnp.asarray([1.5, np.nan], jnp.bfloat16),
     "nested": {"reward/progress": np.array([np.nan, -0.0, np.inf], np.float32)},
 }
 
@@ -341,6 +343,15 @@ def test_a_long_reason_keeps_its_beginning_and_its_end(run_dir, monkeypatch):
     assert "RESOURCE_EXHAUSTED: xxx" in said
     assert "xxx the end; the earlier" in said
     assert len(said) < 600
+
+
+def test_a_run_folder_that_is_moved_away_is_not_made_again(run_dir, monkeypatch):
+    save(run_dir, 1)
+    away = run_dir.with_name("away")
+    monkeypatch.setattr(CheckpointStore, "_check_space", lambda *size: run_dir.rename(away))
+    assert "No such file or directory" in refused(save, run_dir, 2)
+    assert not run_dir.exists()
+    assert checkpoint_steps(away) == [1]
 
 
 def test_a_folder_that_cannot_be_made_costs_one_line(tmp_path):
