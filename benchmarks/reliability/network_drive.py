@@ -3,9 +3,9 @@
 The run folder is a drive whose calls are late, are interrupted, or fail, now and then or all from a
 moment on, as those of a network drive do. Each training is killed, or ends by itself where the
 drive fails, and is given the same command again, until it is complete. Late calls must change
-nothing. A call that fails must cost one line and no checkpoint; so does one that is interrupted in
-TensorStore, which does not repeat it as Python does. All must end with the same bits as a training
-on a drive without faults. It needs FUSE, libfuse and mfusepy.
+nothing. A call that fails must cost one line and no checkpoint; so may one that is interrupted
+while TensorStore reads, which does not repeat it as Python does. All must end with the same bits as
+a training on a drive without faults. It needs FUSE, libfuse and mfusepy.
 """
 
 import os

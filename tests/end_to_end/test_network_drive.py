@@ -40,7 +40,8 @@ def test_a_training_ends_with_the_same_bits_and_errors_are_one_line(ground, tmp_
     assert row.wrong == ""
     assert row.faults > 0
     assert row.starts > 1
-    assert bool(row.lines) == (name != "late")
+    # Python repeats a call that is interrupted, and TensorStore, which reads, does not.
+    assert name == "interrupted" or bool(row.lines) == (name != "late")
 
 
 @mounted
