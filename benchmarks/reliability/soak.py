@@ -286,7 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.output:
         check_output(options.output)
     # A run of the configuration's own length would end after seconds.
-    longest = [] if any("num_timesteps" in x for x in options.overrides) else ["1e15"]
+    longest = [] if any("num_timesteps" in x for x in options.overrides) else ["1e11"]
     settings = [*options.overrides, *(f"ppo.num_timesteps={one}" for one in longest)]
     config = load_config(options.config, settings)
     values: dict[str, Any] = {}

@@ -16,6 +16,9 @@ from jetbot_mjx.config.value_types import (
     Steps,
 )
 
+_MOST_COUNTED = 2**31 - 1
+"""Minibatches that a schedule of optax can count."""
+
 
 class NetworkConfig(Section):
     """Policy and value networks, in the names of `brax.training.agents.ppo.networks`."""
@@ -138,6 +141,13 @@ class PPOConfig(Section):
             raise ValueError(
                 f"batch_size * num_minibatches = {unrolls} is not a multiple of"
                 f" num_envs = {self.num_envs}: for example batch_size = {fit}"
+            )
+        if self.learning_rate_schedule == "LINEAR" and self.gradient_steps > _MOST_COUNTED:
+            most = _MOST_COUNTED // self.updates_per_training_step * self.steps_per_training_step
+            raise ValueError(
+                f"num_timesteps = {self.num_timesteps} has {self.gradient_steps:.1e} minibatches,"
+                f" and learning_rate_schedule = 'LINEAR' counts {_MOST_COUNTED:,}: train for at"
+                f" most {most} steps, or choose another schedule"
             )
         low, high = self.learning_rate_schedule_min_lr, self.learning_rate_schedule_max_lr
         if self.learning_rate_schedule == "ADAPTIVE_KL" and not low <= self.learning_rate <= high:

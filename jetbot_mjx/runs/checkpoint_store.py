@@ -371,11 +371,18 @@ def read_tree(path: Path, name: str, template: PyTree) -> PyTree:
 
 
 def flatten(tree: PyTree) -> dict[str, PyTree]:
-    """Return the leaves of a tree by their path, such as `params.policy.hidden_0.bias`."""
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="."): leaf
-        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
-    }
+    """Return the leaves of a tree by their path, such as `params.policy.hidden_0.bias`.
+
+    Raises:
+      CheckpointError: two leaves have the same path, as those of `{"a.b": 1, "a": {"b": 2}}`.
+    """
+    found: dict[str, PyTree] = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        if name in found:
+            raise CheckpointError(f"two arrays of the state are called {name}: rename one of them")
+        found[name] = leaf
+    return found
 
 
 def digest(tree: PyTree) -> str:

@@ -138,6 +138,12 @@ OTHER_TEMPLATES = {
 }
 
 
+def test_two_arrays_of_one_name_are_refused(run_dir):
+    tree = {"a.b": np.zeros(1), "a": {"b": np.ones(2)}}
+    said = refused(lambda: save(run_dir, 1, tree=tree))
+    assert "two arrays of the state are called a.b" in said
+
+
 def test_a_joined_tree_is_one_array_on_disk_and_refused_if_it_is_shorter(run_dir):
     save(run_dir, 1, joined=("tree",))
     save(run_dir, 2, joined=("tree",), tree={"weights": np.zeros(2)})
