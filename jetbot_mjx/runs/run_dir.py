@@ -99,9 +99,12 @@ def claim_run_dir(
     Raises:
       UserError: the folder cannot be created.
     """
+    if given is not None:
+        yield Path(given)
+        return
     first = default_run_dir(config_path, root)
-    if given is not None or not creates:
-        yield first if given is None else Path(given)
+    if not creates:
+        yield first
         return
     for count in itertools.count(1):
         run_dir = first.with_name(f"{first.name}-{count}") if count > 1 else first

@@ -114,7 +114,7 @@ def test_a_result_cannot_command_the_terminal(capsys):
     ],
 )
 def test_tasks(name):
-    with pytest.raises(UserError, match=re.escape(f"task.name = {name!r}")):
+    with pytest.raises(UserError, match=rf"task\.name( =|:) {re.escape(repr(name))}"):
         make_env(parse_config({"task": {"name": name}}))
 
 
