@@ -108,10 +108,11 @@ def claim_run_dir(
         return
     for count in itertools.count(1):
         run_dir = first.with_name(f"{first.name}-{count}") if count > 1 else first
-        with writing_to(run_dir), contextlib.suppress(FileExistsError):
+        with writing_to(run_dir):
             make_folders(root)
-            run_dir.mkdir()
-            break
+            with contextlib.suppress(FileExistsError):
+                run_dir.mkdir()
+                break
     try:
         yield run_dir
     finally:
