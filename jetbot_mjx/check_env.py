@@ -1,8 +1,9 @@
 """Check a task or an environment before it is trained: `jetbot-mjx check-env my_env.yaml`.
 
 Every mistake is reported in one line that says how to correct it. Name a configuration, a class as
-`file.py:Class` or `package.module:Class`, or a built-in task by its class alone, such as `GoalTask`. `--config` checks
-a class with the settings of a run. Of an environment of your own, sizes and costs are told, too.
+`file.py:Class` or `package.module:Class`, or a built-in task by its class alone, such as
+`GoalTask`. `--config` checks a class with the settings of a run. Of an environment of your own,
+sizes and costs are told, too.
 """
 
 import argparse

@@ -78,7 +78,7 @@ class Config(Section):
     """Training ends at the first evaluation with this success rate; null: never before the end."""
     stop_at_return: Annotated[float, Field(allow_inf_nan=False)] | None = None
     """Training ends at the first evaluation with this mean return of an episode, likewise."""
-    environment: Annotated[str, BeforeValidator(class_name)] | None = None
+    environment: Annotated[str, AfterValidator(class_name)] | None = None
     """An environment of your own to train in, in place of the robot and its task: a class, or a
     function that returns one, as `file.py:Class` with a file beside this one, or
     `package.module:Class`."""

@@ -3,7 +3,7 @@
 import math
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, Field
 
 from jetbot_mjx.config.section import Section
 from jetbot_mjx.config.task_modules import class_name
@@ -13,7 +13,7 @@ from jetbot_mjx.config.value_types import Count, NonNegative, Positive, Scalar, 
 class TaskConfig(Section):
     """The task, and the observations and actions of the policy."""
 
-    name: Annotated[str, BeforeValidator(class_name)] = "jetbot_mjx:GoalTask"
+    name: Annotated[str, AfterValidator(class_name)] = "jetbot_mjx:GoalTask"
     """The task class, as `file.py:Class` or `package.module:Class`, built as `Class(task_config)`;
     this package's own is named by the package alone."""
     observation: Literal["world", "egocentric", "camera", "camera+world", "camera+egocentric"] = (

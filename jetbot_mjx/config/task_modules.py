@@ -23,14 +23,12 @@ TASK_FOLDERS: dict[str, Path] = {}
 name. They are also in `sys.path`."""
 
 
-def class_name(value: object) -> object:
+def class_name(value: str) -> str:
     """Return the name of a class as `module:Class`, of one in a file `folder/file.py:Class` too.
 
     Raises:
       ValueError: it is neither.
     """
-    if not isinstance(value, str):
-        return value
     module, separator, name = value.partition(":")
     if separator and module.endswith(".py"):
         module = ".".join(Path(module.removesuffix(".py")).parts)
