@@ -13,6 +13,7 @@ from onekernel.aot.program_cache import ProgramCache
 
 IMAGES = "it takes observations without images"
 WITHOUT_FUSED_UPDATE = {
+    "best_camera": IMAGES,
     "camera_gpu": IMAGES,
     "camera_real": IMAGES,
     "jetbot_camera": IMAGES,
