@@ -17,8 +17,6 @@ from jetbot_mjx.errors import InvalidError
 BROKEN = 1
 """Exit code for a task or an environment that has an error."""
 
-_BUILT_IN = "jetbot_mjx"
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and check the task or the environment.
@@ -71,7 +69,7 @@ def _config(options: argparse.Namespace) -> Config:
         return cli.config_of(options)
     if _is_environment(what):
         return cli.config_of(options, f"environment={what}")
-    name = what if ":" in what else f"{_BUILT_IN}:{what}"
+    name = what if ":" in what else f"jetbot_mjx:{what}"
     return cli.config_of(options, f"task.name={name}")
 
 
