@@ -42,6 +42,9 @@ class ReturnSummary(NamedTuple):
     episode_length: float
     """Mean number of environment steps until the end."""
     nonfinite_envs: int
+    metrics: Mapping[str, float | None]
+    """Sum over an episode of each of the environment's own metrics, mean over all episodes; None:
+    it is not finite."""
     success_rate: float | None = None
     success_low: float | None = None
     """Lower end of the 95 % Wilson interval."""
@@ -65,6 +68,7 @@ def summarize_returns(episodes: ReturnEpisodes, *, has_success: bool) -> ReturnS
     returns = host.episode_return.astype(np.float64)
     count, mean = returns.size, float(returns.mean())
     spread = NORMAL_QUANTILE * float(returns.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
+    sums = {name: float(x.mean(dtype=np.float64)) for name, x in host.metrics.items()}
     success: dict[str, float] = {}
     if has_success:
         wins = int((host.success > 0).sum())
@@ -78,6 +82,7 @@ def summarize_returns(episodes: ReturnEpisodes, *, has_success: bool) -> ReturnS
         return_min=float(returns.min()),
         episode_length=float(host.steps.mean()),
         nonfinite_envs=int(host.nonfinite.sum()),
+        metrics={name: mean if math.isfinite(mean) else None for name, mean in sums.items()},
         **success,
     )
 

@@ -5,7 +5,7 @@ that a scripted controller can be evaluated like a policy. This module adds the 
 `jax.vmap`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -24,6 +24,9 @@ _ACTION_DRAWS = 0x61637473
 
 _PATH = "path_length"
 """Key of the distance travelled in the state's `info` [m]."""
+
+_OTHER_SUMS = frozenset({"success", "sum_reward", "length", "nonfinite_envs"})
+"""Names in `episode_metrics` that mean the same for every environment."""
 
 Controller = Callable[[PyTree, State, UInt32[Array, "2"]], Float[Array, " action"]]
 
@@ -70,6 +73,8 @@ class ReturnEpisodes(NamedTuple):
     terminated: Float[Array, " n"]
     nonfinite: Float[Array, " n"]
     qpos: Float[Array, "n time nq"] | None
+    metrics: Mapping[str, Float[Array, " n"]]
+    """Sum of each of the environment's own metrics over the episode."""
 
 
 Rollout = Callable[[int | Int[Array, ""], PyTree, UInt32[Array, "n 2"]], Episodes]
@@ -160,12 +165,14 @@ def return_rollout_fn(
     """
     one = envs.KernelWrapper(_OneEpisodeWrapper(envs.EpisodeWrapper(env, episode_length)))
     run = _loop_fn(one, controllers, episode_length, jax.vmap(env.qpos) if record else None)
+    names = sorted({*env.metrics} - _OTHER_SUMS)
 
     def rollout(
         index: int | Int[Array, ""], params: PyTree, keys: UInt32[Array, "n 2"]
     ) -> ReturnEpisodes:
         _, last, qpos = run(index, params, keys)
-        return ReturnEpisodes(**_totals(last), qpos=qpos)
+        totals, sums = _totals(last), last.info["episode_metrics"]
+        return ReturnEpisodes(**totals, qpos=qpos, metrics={name: sums[name] for name in names})
 
     return rollout
 

@@ -9,6 +9,7 @@ timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.p
   eval/episode_return       [m] mean sum of rewards, about the distance covered; of an
                             `environment` in its own unit, with return_low, return_high,
                             return_min, episode_length
+  eval/metrics/<name>       sum over an episode of a metric of an `environment`, mean over all
   eval/final_distance_median  [m] distance to the goal at the end, on the floor
   eval/nonfinite_envs       episodes that were cut off because of a non-finite state
   loss/total, policy, value, entropy  means over the applied updates, as Brax computes them

@@ -178,7 +178,7 @@ class RunRecorder(TrainerCallback, contextlib.AbstractContextManager["RunRecorde
             steps = one.env_steps - seed.standing.env_steps
             training = one.seconds - (compiling if one.state is None else 0.0)
             metrics = {
-                **{f"eval/{name}": value for name, value in summary._asdict().items()},
+                **{f"eval/{name}": value for name, value in _by_name(summary).items()},
                 **one.metrics,
                 "time/env_steps_per_second": steps / training if steps and training > 0 else None,
                 "time/training_seconds": training,
@@ -339,7 +339,7 @@ class SeedRecorder:
         with runs.writing_to(self.run_dir):
             for sink in self.sinks:
                 sink.write(progress.env_steps, metrics)
-        self.save(progress, summary._asdict(), wall_seconds, summary.score)
+        self.save(progress, _by_name(summary), wall_seconds, summary.score)
         self.fingerprint = runs.digest(progress.params)
 
     def save(
@@ -385,3 +385,10 @@ class SeedRecorder:
             for sink in self.sinks:
                 stack.callback(sink.close)
             stack.enter_context(self._store)
+
+
+def _by_name(summary: Summary | ReturnSummary) -> dict[str, float | None]:
+    """Return the metrics of an evaluation by name, those of the environment below `metrics/`."""
+    values = summary._asdict()
+    own = values.pop("metrics", {})
+    return {**values, **{f"metrics/{name}": value for name, value in own.items()}}

@@ -70,6 +70,12 @@ def test_a_report_holds_the_returns_and_shows_them(folder, compared):
     assert policy["return_min"] == min(values["returns"])
     assert policy["success_low"] <= policy["success_rate"] <= policy["success_high"]
     assert set(values["baselines"]) == {"random", "zero"}
+    assert 0 <= policy["metrics"]["near"] <= 16
+    lines = (folder / "one" / "metrics.jsonl").read_text("utf-8").splitlines()
+    logged = [json.loads(line) for line in lines]
+    assert all(0 <= line["eval/metrics/near"] <= 16 for line in logged)
+    shown = f"<tr><th>near</th><td>{policy['metrics']['near']:,.4g}</td>"
+    assert shown in (home / "report.html").read_text("utf-8")
     # Where no force acts, the point stays where it began, and every reward is the same.
     assert values["baselines"]["zero"]["episode_length"] == 16
     steps = [point["env_steps"] for point in values["learning_curve"]]

@@ -19,6 +19,7 @@ def episodes(**fields):
     zeros = np.zeros(4, np.float32)
     known = {"success": zeros, "steps": np.float32([5, 10, 5, 20]), "episode_return": RETURNS}
     rest = {"terminated": zeros, "nonfinite": np.float32([0, 1, 0, 1]), "qpos": None}
+    rest["metrics"] = {}
     return ReturnEpisodes(**(known | rest | fields))
 
 
@@ -41,7 +42,7 @@ def test_the_score_is_the_success_rate_where_there_is_one():
 
 def test_one_episode_has_no_spread():
     one = episodes()._replace(
-        **{name: np.ones(1, np.float32) for name in ReturnEpisodes._fields if name != "qpos"}
+        **dict.fromkeys({*ReturnEpisodes._fields} - {"qpos", "metrics"}, np.ones(1, np.float32))
     )
     summary = summarize_returns(one, has_success=False)
     assert (summary.return_low, summary.episode_return, summary.return_high) == (1.0, 1.0, 1.0)
@@ -50,7 +51,7 @@ def test_one_episode_has_no_spread():
 def test_baselines_run_whole_episodes():
     config = parse_config(
         {
-            "environment": "helpers.own_environments:Point",
+            "environment": "helpers.own_environments:Measured",
             "task": {"episode_length": 6},
             "ppo": {"network": {"policy_hidden_layer_sizes": [4]}},
         }
@@ -69,5 +70,10 @@ def test_baselines_run_whole_episodes():
     starts = np.asarray(jax.vmap(env.reset)(keys).obs[:, 0])
     np.testing.assert_allclose(found.episode_return, 6 * (1 - starts**2), rtol=1e-5)
     np.testing.assert_array_equal(found.steps, 6)
+    # The trainer's own length is not among the environment's metrics.
+    assert {*found.metrics} == {"<steps>", "speed", "broken"}
+    np.testing.assert_array_equal(found.metrics["<steps>"], 6)
+    summary = summarize_returns(found, has_success=False)
+    assert summary.metrics == {"<steps>": 6.0, "speed": 0.0, "broken": None}
     assert {*return_baselines(env)} == {"random", "zero"}
     assert jnp.all(found.success == 0)

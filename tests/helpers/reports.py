@@ -91,6 +91,7 @@ def return_report_of(returns, run_dir="runs/a", curve=(), steps=10, **settings):
         terminated=zeros,
         nonfinite=zeros,
         qpos=None,
+        metrics={},
     )
     return ReturnReport(
         folder=Path(run_dir) / "evaluations" / "2048",
