@@ -70,7 +70,7 @@ class ReturnReport(NamedTuple):
         """Return the headline and the folder in one line."""
         return (
             f"ReturnReport(run={str(self.run)!r}, env_steps={self.env_steps},"
-            f" return={self.policy.episode_return:.1f}, folder={str(shortened(self.folder))!r})"
+            f" return={self.policy.episode_return:z.2f}, folder={str(shortened(self.folder))!r})"
         )
 
     @property
@@ -148,7 +148,7 @@ class ReturnComparison(NamedTuple):
 
     def __repr__(self) -> str:
         """Return the mean return of each run and the folder in one line."""
-        means = {run.name: f"{run.episode_return.mean.value:.1f}" for run in self.runs}
+        means = {run.name: f"{run.episode_return.mean.value:z.2f}" for run in self.runs}
         return f"ReturnComparison(return={means}, folder={str(shortened(self.folder))!r})"
 
     def to_json(self) -> JsonObject:

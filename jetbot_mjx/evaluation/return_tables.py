@@ -33,7 +33,7 @@ def summarize_return_comparison(comparison: ReturnComparison) -> str:
         found = run.episode_return
         success = run.success_rate.mean.told("{:.2%}") if run.success_rate else "-"
         over = f"{found.count:,} {found.over}"
-        both = found.mean.told("{:.2f}"), found.iqm.told("{:.2f}")
+        both = found.mean.told("{:z.2f}"), found.iqm.told("{:z.2f}")
         rows.append((run.name, *both, success, over))
     lines = [
         f"{comparison.episodes:,} fixed starts, {len(policies)} policies",
@@ -41,7 +41,7 @@ def summarize_return_comparison(comparison: ReturnComparison) -> str:
         f"\n{text_table(rows)}\n",
     ]
     lines += [
-        f"{pair.a} against {pair.b}: {pair.episode_return.told('{:+.2f}', 'starts')}"
+        f"{pair.a} against {pair.b}: {pair.episode_return.told('{:+z.2f}', 'starts')}"
         for pair in comparison.pairs
     ]
     lines += comparison.other_code
@@ -53,9 +53,9 @@ def _policies_table(policies: Mapping[str, ReturnSummary]) -> str:
     rows += [
         (
             name,
-            f"{one.episode_return:.2f}",
-            f"{one.return_low:.2f} .. {one.return_high:.2f}",
-            f"{one.return_min:.2f}",
+            f"{one.episode_return:z.2f}",
+            f"{one.return_low:z.2f} .. {one.return_high:z.2f}",
+            f"{one.return_min:z.2f}",
             f"{one.episode_length:.1f}",
             "-" if one.success_rate is None else f"{one.success_rate:.2%}",
         )

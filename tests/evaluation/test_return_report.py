@@ -92,6 +92,6 @@ def test_runs_with_other_code_of_one_name_are_told():
 def test_reports_and_comparisons_are_shown_in_one_line():
     one = return_report_of([1.0, 2.0])
     assert repr(one) == (
-        "ReturnReport(run='runs/a', env_steps=2048, return=1.5, folder='runs/a/evaluations/2048')"
+        "ReturnReport(run='runs/a', env_steps=2048, return=1.50, folder='runs/a/evaluations/2048')"
     )
-    assert repr(compared(a=[one])) == "ReturnComparison(return={'a': '1.5'}, folder='somewhere')"
+    assert repr(compared(a=[one])) == "ReturnComparison(return={'a': '1.50'}, folder='somewhere')"

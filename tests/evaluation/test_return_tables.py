@@ -35,3 +35,8 @@ def test_a_comparison_shows_policies_runs_and_pairs():
     assert lines[-2].startswith("a against b: difference -2.00")
     assert lines[-2].endswith("starts 1 : 1 (p 1)")
     assert lines[-1] == "report: there/comparison.html"
+
+
+def test_a_return_that_rounds_to_zero_has_no_sign():
+    line = summarize_return_report(return_report_of([-1e-3, 1e-3])).splitlines()[2]
+    assert line.split() == ["policy", "0.00", "0.00", "..", "0.00", "0.00", "10.0", "-"]
