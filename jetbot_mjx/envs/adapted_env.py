@@ -139,13 +139,13 @@ class AdaptedEnv(Env):
                 " them"
             )
         # Of what is kept, only some is read; of the rest of an outcome, all is.
-        paths = jax.tree_util.tree_leaves_with_path(first.kept)
-        read = _read_leaves(step_jaxpr, len(paths))
-        self._names = [
-            jax.tree_util.keystr(path).lstrip(".")
-            for (path, _), one in zip(paths, read, strict=True)
-            if one
-        ]
+        leaves = jax.tree_util.tree_leaves_with_path(first.kept)
+        read = _read_leaves(step_jaxpr, len(leaves))
+        paths = [path for (path, _), one in zip(leaves, read, strict=True) if one]
+        self._names = [jax.tree_util.keystr(path).lstrip(".") for path in paths]
+        # Where MuJoCo's generalised position is, in an attribute or in a dictionary.
+        ends = [jax.tree_util.keystr(path[-1:], simple=True) for path in paths]
+        self._qpos = self._names[ends.index("qpos")] if "qpos" in ends else None
         shown = first._replace(kept=None)
         self._shown = jax.tree.structure(shown)
         wanted = [*read, *[True] * self._shown.num_leaves]
@@ -280,11 +280,6 @@ class AdaptedEnv(Env):
         owners: list[Any] = [self.source, getattr(self.source, "sys", None)]
         model = next((x.mj_model for x in owners if hasattr(x, "mj_model")), None)
         return model if isinstance(model, mujoco.MjModel) and self._qpos else None
-
-    @property
-    def _qpos(self) -> str | None:
-        """Return the path of MuJoCo's generalised position in what is kept."""
-        return next((name for name in self._names if name.rpartition(".")[2] == "qpos"), None)
 
     def qpos(self, state: State) -> Float[Array, " nq"]:
         """Return MuJoCo's generalised position in a state, of an environment with an `mj_model`."""

@@ -219,7 +219,8 @@ def test_what_it_says_of_itself():
         del NoisyPoint.dt
 
 
-def test_a_state_of_mujoco_can_be_shown():
+@pytest.mark.parametrize("kind", [Physics, lambda qpos, qvel: {"qpos": qpos, "qvel": qvel}])
+def test_a_state_of_mujoco_can_be_shown(kind):
     mujoco = pytest.importorskip("mujoco")
 
     class Physical(Lever):
@@ -230,11 +231,11 @@ def test_a_state_of_mujoco_can_be_shown():
 
         def reset(self, rng):
             state = super().reset(rng)
-            return state.replace(place=Physics(jnp.ones(1), jnp.ones(1)))
+            return state.replace(place=kind(jnp.ones(1), jnp.ones(1)))
 
         def step(self, state, action):
-            place = Physics(*(x + 1 for x in state.place))
-            return state.replace(place=place, obs=place.qpos[0])
+            place = jax.tree.map(lambda x: x + 1, state.place)
+            return state.replace(place=place, obs=jax.tree.leaves(place)[0][0])
 
     env = adapted(Physical)
     assert env.mj_model is env.source.mj_model
