@@ -24,16 +24,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     with startup.exit_on_interrupt():
         from jetbot_mjx.envs import make_env
-        from jetbot_mjx.runs import NAN_DUMP_HEADER, format_step, load_nan_dump, replay_nan_dump
+        from jetbot_mjx.runs import format_step, load_nan_dump, replay_header, replay_nan_dump
     cli.prepare_device()
     with cli.trusting(options.trust):
         stored = load_nan_dump(options.file)
+    env = make_env(stored.config.for_any_device(), own_class=stored.own_class)
     cli.tell(
         f"the state became non-finite before step {stored.env_steps:,} of the training; the unroll"
-        f" up to there:\n{NAN_DUMP_HEADER}"
+        f" up to there:\n{replay_header(env)}"
     )
     nonfinite: list[str] = []
-    env = make_env(stored.config.for_any_device(), own_class=stored.own_class)
     for index, step in enumerate(replay_nan_dump(stored, env)):
         cli.tell(format_step(index, step))
         nonfinite = step.nonfinite

@@ -40,6 +40,8 @@ class SharedRun(NamedTuple):
     files: int
     size: int
     """Bytes of all files."""
+    command: str
+    """Command by which others use it first."""
     missing: Mapping[str, str]
     """What could not be made, with the reason."""
 
@@ -89,7 +91,8 @@ def share_run(
         title = f"{checkpoint.run_dir.name} after {checkpoint.env_steps:,} steps"
         with stage(f"uploading {len(files)} files, {size / 1e6:.1f} MB"):
             uploaded = runs.upload_run(name, files, title, private=private)
-    return SharedRun(name, *uploaded, files=len(files), size=size, missing=missing)
+    command = f"jetbot-mjx {_commands(checkpoint)[0]} {name}"
+    return SharedRun(name, *uploaded, len(files), size, command, missing)
 
 
 def summarize_sharing(shared: SharedRun) -> str:
@@ -99,7 +102,7 @@ def summarize_sharing(shared: SharedRun) -> str:
         f" revision {shared.revision}"
     ]
     lines += [f"  without {what}: {reason}" for what, reason in shared.missing.items()]
-    return "\n".join([*lines, f"anyone can use it: jetbot-mjx play {shared.name}"])
+    return "\n".join([*lines, f"anyone can use it: {shared.command}"])
 
 
 def _report(run: Path, checkpoint: Checkpoint) -> Path:
@@ -198,6 +201,8 @@ def model_card(
     clip = "\n![The policy drives](clip.gif)\n" if "clip.gif" in files else ""
     trust = f" It names code of its author, `{_code(config.code)}`: read it, then add `--trust`."
     names_code = any(x.startswith("task/") for x in files) or config.environment
+    extras = "hub" if config.environment else "hub,play"
+    commands = "\n".join(f"jetbot-mjx {one} {name}" for one in _commands(checkpoint))
     return f"""---
 {_front_matter(licence)}
 ---
@@ -213,9 +218,8 @@ A policy for {task}, trained for {checkpoint.env_steps:,} environment steps with
 ## Use it
 
 ```sh
-pip install 'jetbot_mjx[hub,play]'
-jetbot-mjx play {name}
-jetbot-mjx evaluate {name}
+pip install 'jetbot_mjx[{extras}]'
+{commands}
 ```
 
 ```python
@@ -228,6 +232,11 @@ policy = load_policy("{name}")  # policy(obs) is the action
 {_list_of(files)}
 Licence: {licence}.
 """
+
+
+def _commands(checkpoint: Checkpoint) -> list[str]:
+    """Return the commands that use a policy: only a robot can be played with."""
+    return ["evaluate"] if checkpoint.config.environment else ["play", "evaluate"]
 
 
 def _front_matter(licence: str) -> str:

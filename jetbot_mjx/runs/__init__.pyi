@@ -24,9 +24,9 @@ from .metrics import Sink as Sink
 from .metrics import TensorBoardSink as TensorBoardSink
 from .metrics import mean_of as mean_of
 from .metrics import read_history as read_history
-from .nan_dump import NAN_DUMP_HEADER as NAN_DUMP_HEADER
 from .nan_dump import format_step as format_step
 from .nan_dump import load_nan_dump as load_nan_dump
+from .nan_dump import replay_header as replay_header
 from .nan_dump import replay_nan_dump as replay_nan_dump
 from .nan_dump import save_nan_dump as save_nan_dump
 from .resumption import Resumption as Resumption

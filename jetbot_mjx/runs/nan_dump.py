@@ -33,12 +33,6 @@ _MOST_BYTES = 100_000_000
 
 _FORMAT = "jetbot_mjx.nan_dump/1"
 
-NAN_DUMP_HEADER = (
-    f"{'step':>4}  {'action':>15}  {'x [m]':>8} {'y [m]':>8} {'z [m]':>8}  {'yaw':>8}"
-    f"  {'max |qvel|':>10}  not finite"
-)
-"""Names of the columns of `format_step`."""
-
 
 class StoredNanDump(NamedTuple):
     """A `StoredNanDump` holds a dump that was loaded from a file."""
@@ -179,11 +173,22 @@ def replay_nan_dump(stored: StoredNanDump, env: JetBotEnv | AdaptedEnv) -> Itera
         state = step(state, action[None])
 
 
+def replay_header(env: JetBotEnv | AdaptedEnv) -> str:
+    """Return the names of the columns of `format_step`."""
+    if isinstance(env, AdaptedEnv):
+        return f"{'step':>4}  {'action':>{8 * env.action_size - 1}}  not finite"
+    return (
+        f"{'step':>4}  {'action':>15}  {'x [m]':>8} {'y [m]':>8} {'z [m]':>8}  {'yaw':>8}"
+        f"  {'max |qvel|':>10}  not finite"
+    )
+
+
 def format_step(index: int, step: ReplayStep) -> str:
     """Return one step as a line of the table; only a robot has a pose."""
     if not isinstance(step.state.pipeline_state, PhysicsState):
         action = " ".join(f"{x:+7.3f}" for x in step.action)
-        return f"{index:4d}  {action}  {', '.join(step.nonfinite)}"
+        told = [name.removeprefix("pipeline_state.kept.") for name in step.nonfinite]
+        return f"{index:4d}  {action}  {', '.join(told)}"
     robot = envs.robot_state(jax.tree.map(jnp.asarray, step.state.pipeline_state))
     x, y, z = np.asarray(robot.position_w)
     fastest = np.abs(step.state.pipeline_state.qvel).max()

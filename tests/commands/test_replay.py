@@ -1,15 +1,18 @@
-"""`replay` refuses files that are not NaN dumps."""
+"""`replay` refuses files that are not NaN dumps, and shows of each step what there is."""
 
 import json
 import os
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from jetbot_mjx import replay
 from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.runs import nan_dump
+from jetbot_mjx.runs.nan_dump import ReplayStep, format_step, replay_header
 
 
 def test_replay_refuses_a_file_that_is_no_nan_dump(refused, here, tmp_path):
@@ -42,3 +45,12 @@ def test_replay_refuses_arrays_of_another_kind(refused, tmp_path, value):
     np.savez(tmp_path / "dump.npz", **arrays)
     line = refused(replay, tmp_path / "dump.npz")
     assert "dump.npz does not fit its task: actions is " in line
+
+
+def test_the_table_of_an_environment_of_ones_own_has_no_pose():
+    env = make_env(parse_config({"environment": "helpers.own_environments:Point"}))
+    state = env.reset(jax.random.PRNGKey(0))
+    step = ReplayStep(np.float32([0.5]), state, ["pipeline_state.kept.x", "reward"])
+    assert replay_header(env).split() == ["step", "action", "not", "finite"]
+    assert format_step(8, step).split() == ["8", "+0.500", "x,", "reward"]
+    assert replay_header(env).index("not") == format_step(8, step).index("x,")

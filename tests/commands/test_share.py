@@ -21,7 +21,15 @@ def test_it_shares_what_it_is_told_to(hub, trained, monkeypatch, capsys):
 
     def share_run(run, name, **more):
         given.append((run, name, more))
-        return SharedRun(name, "http://hub/ada/x", "abc", 3, 5_000_000, {"a clip": "no OpenGL"})
+        return SharedRun(
+            name,
+            "http://hub/ada/x",
+            "abc",
+            3,
+            5_000_000,
+            f"jetbot-mjx play {name}",
+            {"a clip": "no OpenGL"},
+        )
 
     monkeypatch.setattr(deployment, "share_run", share_run)
     words = [str(trained), "--to", "hf:ada/x", "--checkpoint", "2048", "--license", "mit"]

@@ -10,7 +10,7 @@ import pytest
 
 from helpers import fake_hub
 from jetbot_mjx import runs
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.deployment import sharing
 from jetbot_mjx.deployment.sharing import model_card, share_run, summarize_sharing
 from jetbot_mjx.envs import JetBotEnv
@@ -230,6 +230,15 @@ def test_the_card_tells_returns_and_the_other_simulator(run):
     assert "| success |" not in card(run, values)
     mujoco = {**REPORT, "mujoco": {"policy": {**POLICY, "success_rate": 0.9}}}
     assert "| success in C MuJoCo | 90.00% | 99.29% to 99.95% |" in card(run, mujoco)
+
+
+def test_an_environment_is_evaluated_and_not_played_with(run):
+    config = parse_config({"environment": "slide:Slide"})
+    checkpoint = runs.load_checkpoint(run)._replace(config=config)
+    files = ["evaluations/1/report.md"]
+    text = model_card("hf:ada/robot", checkpoint, REPORT, licence="mit", files=files)
+    assert "pip install 'jetbot_mjx[hub]'\njetbot-mjx evaluate hf:ada/robot\n```" in text
+    assert "play" not in text
 
 
 def test_the_card_warns_of_the_authors_code_and_quotes_it_safely(run, monkeypatch):
