@@ -134,43 +134,41 @@ def _undistort(
     """
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
 
-    def distort(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def distort(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return x" and y", and the derivatives dx"/dx, dx"/dy = dy"/dx and dy"/dy."""
         r2 = x * x + y * y
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = above / below
+        # By the square of the radius.
+        rising = k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
+        rising = 2 * rising / below
         return (
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
             y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+            radial + x * x * rising + 2 * p1 * y + 6 * p2 * x,
+            x * y * rising + 2 * p1 * x + 2 * p2 * y,
+            radial + y * y * rising + 2 * p2 * x + 6 * p1 * y,
         )
 
-    def derivatives(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return dx"/dx, dx"/dy, dy"/dx and dy"/dy."""
-        (above_x, above_y), (below_x, below_y) = distort(x + step, y), distort(x - step, y)
-        xx, yx = (above_x - below_x) / (2 * step), (above_y - below_y) / (2 * step)
-        (above_x, above_y), (below_x, below_y) = distort(x, y + step), distort(x, y - step)
-        return xx, (above_x - below_x) / (2 * step), yx, (above_y - below_y) / (2 * step)
-
-    step = 1e-6
     wanted_x, wanted_y = np.broadcast_arrays(x, y)
     x, y = wanted_x, wanted_y
     # Coefficients that describe no lens may overflow here; the check of the error refuses them.
     with np.errstate(all="ignore"):
         for _ in range(50):
-            at_x, at_y = distort(x, y)
-            xx, xy, yx, yy = derivatives(x, y)
+            at_x, at_y, xx, xy, yy = distort(x, y)
             error_x, error_y = wanted_x - at_x, wanted_y - at_y
             if max(np.abs(error_x).max(), np.abs(error_y).max()) < 1e-12:
                 break
-            determinant = xx * yy - xy * yx
+            determinant = xx * yy - xy * xy
             x = x + (yy * error_x - xy * error_y) / determinant
-            y = y + (xx * error_y - yx * error_x) / determinant
-        at_x, at_y = distort(x, y)
+            y = y + (xx * error_y - xy * error_x) / determinant
+        at_x, at_y, *_ = distort(x, y)
         error = np.maximum(np.abs(at_x - wanted_x), np.abs(at_y - wanted_y))
-        # Past a turning point of the polynomial the image would show a direction twice.
-        turns = False
-        for part in np.linspace(0.0, 1.0, 65):
-            xx, xy, yx, yy = derivatives(part * x, part * y)
-            turns |= not np.all(xx * yy - xy * yx > 0)
-        if turns or not np.all(error < 1e-5):
+        # Past a turning point of the polynomial the image would show a direction twice. All pixels
+        # lie between the centre and the image's edge.
+        edge = [np.concatenate([z[0], z[-1], z[:, 0], z[:, -1]]) for z in (x, y)]
+        *_, xx, xy, yy = distort(*(np.linspace(0.0, 1.0, 65)[:, None] * z for z in edge))
+        if not (np.all(xx * yy - xy * xy > 0) and np.all(error < 1e-5)):
             raise _no_lens(coefficients)
     return x, y
 

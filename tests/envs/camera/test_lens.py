@@ -75,7 +75,7 @@ def pixels_of(config, rays, matrix):
         JETBOT | {"lens": "fisheye"},
         JETBOT | {"lens": "fisheye", "distortion": (-0.02, 0.01, -0.004, 0.0005)},
         HALF | RADIAL,
-        pytest.param(JETBOT | RADIAL, marks=pytest.mark.slow),
+        JETBOT | RADIAL,
         {"width": 64, "height": 48, "matrix": (60.0, 61.0, 30.0, 25.0), "lens": "opencv"}
         | {"distortion": (-0.3, 0.1, 0.002, -0.003, -0.02)},
         {"width": 64, "height": 48, "matrix": (60.0, 61.0, 30.0, 25.0), "lens": "opencv"}
