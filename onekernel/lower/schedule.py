@@ -322,8 +322,9 @@ class _Scheduler:
     def _add_uses(self, block: Block, nodes: Iterable[_Node]) -> None:
         for node in nodes:
             # A node with several users belongs to the innermost block around all of them.
-            known = self._use.get(node.index)
-            self._use[node.index] = block if known is None else _common_ancestor(known, block)
+            known = self._use.setdefault(node.index, block)
+            if known is not block:
+                self._use[node.index] = _common_ancestor(known, block)
 
 
 def _expressions(scalars: Iterable[Scalar]) -> list[Expr]:
