@@ -35,6 +35,7 @@ from jetbot_mjx.config import Config, find_config, load_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import theme, to_png
 from jetbot_mjx.runs import write_bytes
+from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
 from jetbot_mjx.runs.metrics import METRICS
 from jetbot_mjx.runs.run_dir import versions
 from jetbot_mjx.training import session
@@ -166,6 +167,8 @@ class Kills(NamedTuple):
     terminated: int = 0
     ended: int = 0
     """Trainings that came to their end, each bit-identical to the one that was not disturbed."""
+    resumed: int = 0
+    """Kills that left a checkpoint to go on from."""
 
     def __add__(self, other: tuple[int, ...]) -> "Kills":
         """Return the sums."""
@@ -194,9 +197,12 @@ def kill_often(
     Raises:
       RecoveryError: a training did not resume, or did not end as the one that was not disturbed.
     """
-    began = time.monotonic()
-    wanted = finish(folder / "undisturbed", settings, config=config)
+    with Process(folder / "undisturbed", settings, config=config) as process:
+        _wait_for_first_line(process)
+        began = time.monotonic()
+        process.wait()
     longest = time.monotonic() - began
+    wanted = finish(folder / "undisturbed", settings, config=config)
     numbers = iter(range(kills))  # of the kills; its `next` is one operation of Python
 
     def one_job(job: int) -> Kills:
@@ -204,7 +210,8 @@ def kill_often(
         for number in numbers:
             sent = signal.SIGTERM if number % 6 == 5 else signal.SIGKILL
             _kill_once(run_dir, settings, config, sent, rng.uniform(0.0, longest))
-            done += Kills(*(int(sent == each) for each in (signal.SIGKILL, signal.SIGTERM)))
+            counted = (int(sent == each) for each in (signal.SIGKILL, signal.SIGTERM))
+            done += Kills(*counted, resumed=int(bool(checkpoint_steps(run_dir))))
             # Now and then to the end, so that many are compared.
             if rng.random() < 0.2:
                 done += end(run_dir)
@@ -222,11 +229,18 @@ def kill_often(
         return sum(threads.map(one_job, range(jobs)), Kills())
 
 
+def _wait_for_first_line(process: Process) -> None:
+    """Wait until a training says something; before, it imports, and writes nothing."""
+    while not process.stdout and process.code is None:
+        time.sleep(0.01)
+
+
 def _kill_once(
     run_dir: Path, settings: Sequence[str], config: Path, number: signal.Signals, seconds: float
 ) -> None:
-    """Start or resume a training, and end it by a signal after so many seconds."""
+    """Start or resume a training, and end it by a signal so many seconds after its first line."""
     with Process(run_dir, settings, config=config) as process:
+        _wait_for_first_line(process)
         time.sleep(seconds)
         process.send(number)
         process.wait()
@@ -315,7 +329,10 @@ def _kill(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     except RecoveryError as error:
         print(f"a killed training did not recover: {error}")
         return {"failure": str(error)}
-    print(f"killed {done.killed} times, terminated {done.terminated} times: bit-identical")
+    print(
+        f"killed {done.killed} times, terminated {done.terminated} times, {done.resumed} of them"
+        f" after a checkpoint: {done.ended} trainings ended bit-identical"
+    )
     return done._asdict()
 
 
