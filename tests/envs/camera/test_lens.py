@@ -151,6 +151,9 @@ def test_a_calibration_counts_for_other_sizes():
         JETBOT | {"lens": "opencv", "distortion": (-0.3,)},
         # It turns twice: the corners would be found beyond, where the image repeats.
         JETBOT | {"lens": "opencv", "distortion": (-0.8, 0.25)},
+        # No pixel lies near either turn: each is found exactly, on one of both sides.
+        {"width": 8, "height": 8, "matrix": (4.0, 4.0, 3.5, 3.5), "lens": "opencv"}
+        | {"distortion": (-0.8, 0.2592), "samples": 1},
         JETBOT | {"lens": "opencv", "distortion": (0.0, 0.0, 0.0, 0.0, 0.0, -0.5)},
         JETBOT | {"lens": "opencv", "distortion": (1e30,)},
         JETBOT | {"lens": "fisheye", "distortion": (-0.5,)},
