@@ -1,11 +1,12 @@
 """Train for long and see what grows: `python benchmarks/reliability/soak.py --seconds 3600`.
 
 One process trains. At the end of every interval it notes its memory, open files, threads, the
-memory of its device, what its logs grew by, and the rate of steps. A line is fitted to each of
-them: one drifts if its slope is larger than three times its standard error, and changes it by more
-than a hundredth over the whole time. With `--kills`, other trainings are killed at random moments
-and resumed until they end as one that was never disturbed, again and again until there were so many
-kills, five of six by SIGKILL and one by SIGTERM. `--jobs` of them run at a time.
+memory of its device, what its logs grew by, the rate of steps, and the processor time they took. A
+line is fitted to each of them: one drifts if its slope is larger than three times its standard
+error, and changes it by more than a hundredth over the whole time; of files and threads, also by
+more than one. With `--kills`, other trainings are killed at random moments and resumed until they
+end as one that was never disturbed, again and again until there were so many kills, five of six by
+SIGKILL and one by SIGTERM. `--jobs` of them run at a time.
 """
 
 import argparse
@@ -47,6 +48,9 @@ _WARM_UP = 0.25
 _LEAST_SAMPLES = 6
 _LARGEST_CHANGE = 0.01
 """Change over the whole time, relative to the mean, that is no drift."""
+_COUNTS = ("files", "threads")
+_ONE_MORE = 1.5
+"""What the line of a count changes by at most if one came or went, when it is in the middle."""
 _CERTAIN = 3.0
 """Standard errors that a slope has at least if it is one."""
 
@@ -57,6 +61,7 @@ QUANTITIES = {
     "device_memory": "memory of the device [bytes]",
     "log": "growth of the logs [bytes]",
     "rate": "steps per second of training",
+    "work": "processor time of a million steps [s]",
 }
 
 
@@ -74,6 +79,8 @@ class Sample(NamedTuple):
     log: float
     """What the logs grew by in this interval."""
     rate: float
+    work: float
+    """What all threads took; other programs move it less than the rate."""
 
 
 class Slope(NamedTuple):
@@ -109,8 +116,9 @@ def fit(quantity: str, values: Sequence[float]) -> Slope:
     rest = used - mean - slope * at
     error = float(np.sqrt(rest @ rest / (len(used) - 2) / (at @ at)))
     is_certain = abs(slope) > _CERTAIN * error
-    drifts = is_certain and abs(slope) * len(used) > _LARGEST_CHANGE * abs(mean)
-    return Slope(quantity, mean, slope, error, bool(drifts))
+    least = max(_LARGEST_CHANGE * abs(mean), _ONE_MORE * (quantity in _COUNTS))
+    is_much = abs(slope) * len(used) > least
+    return Slope(quantity, mean, slope, error, bool(is_certain and is_much))
 
 
 def watch(config: Config, run_dir: Path, seconds: float) -> list[Sample]:
@@ -123,19 +131,21 @@ def watch(config: Config, run_dir: Path, seconds: float) -> list[Sample]:
     """
     samples: list[Sample] = []
     began, size, steps = time.perf_counter(), _size_of_logs(run_dir), 0
+    worked = time.process_time()
 
     class Recorder(RunRecorder):
         """A recorder that notes what the process has."""
 
         def on_interval(self, progress: Sequence[Progress]) -> bool:
-            nonlocal size, steps
+            nonlocal size, steps, worked
             goes_on = super().on_interval(progress)
-            one, earlier = progress[0], size
+            one, earlier, before = progress[0], size, worked
             size, made, steps = _size_of_logs(run_dir), one.env_steps - steps, one.env_steps
-            now = time.perf_counter() - began
+            now, worked = time.perf_counter() - began, time.process_time()
             if one.seconds > 0:
-                rate = made / one.seconds
-                samples.append(Sample(steps, now, *_process(), float(size - earlier), rate))
+                rate, work = made / one.seconds, 1e6 * (worked - before) / made
+                grown = float(size - earlier)
+                samples.append(Sample(steps, now, *_process(), grown, rate, work))
             return goes_on and now < seconds
 
     with mock.patch.object(session, "RunRecorder", Recorder):
@@ -250,9 +260,10 @@ def _kill_once(
 
 def plot(samples: Sequence[Sample], slopes: Sequence[Slope]) -> Figure:
     """Plot every quantity over the time, and the line that was fitted to it."""
-    figure = Figure(figsize=(9, 7), layout="constrained")
+    figure = Figure(figsize=(9, 9), layout="constrained")
+    every = figure.subplots(4, 2).ravel()
     hours = np.array([one.seconds for one in samples]) / 3600
-    for axes, slope in zip(figure.subplots(3, 2).flat, slopes, strict=True):
+    for axes, slope in zip(every, slopes, strict=False):
         values = np.array([getattr(one, slope.quantity) for one in samples])
         first = int(_WARM_UP * len(samples))
         at = np.arange(len(samples) - first) - (len(samples) - first - 1) / 2
@@ -261,14 +272,16 @@ def plot(samples: Sequence[Sample], slopes: Sequence[Slope]) -> Figure:
         title = QUANTITIES[slope.quantity] + (": drifts" if slope.drifts else "")
         axes.set(title=title, xlabel="time [h]", ylim=(0, 1.1 * max(values.max(), 1)))
         axes.grid(visible=True)
+    for axes in every[len(slopes) :]:
+        axes.remove()
     return figure
 
 
 def _table(slopes: Sequence[Slope]) -> str:
-    lines = [f"{'':32}{'mean':>16}{'an interval':>16}{'error':>14}"]
+    lines = [f"{'':40}{'mean':>16}{'an interval':>16}{'error':>14}"]
     for one in slopes:
         numbers = f"{one.mean:16,.1f}{one.slope:+16,.2f}{one.error:14,.2f}"
-        lines.append(f"{QUANTITIES[one.quantity]:32}{numbers}{'  drifts' * one.drifts}")
+        lines.append(f"{QUANTITIES[one.quantity]:40}{numbers}{'  drifts' * one.drifts}")
     return "\n".join(lines)
 
 
