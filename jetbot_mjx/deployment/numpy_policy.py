@@ -355,7 +355,7 @@ def record_environment(checkpoint: Checkpoint, setup: Setup, count: int = RECORD
         steps = -(-count // _RECORDED_AT_ONCE)
         return jax.lax.scan(step, batch.reset(keys), length=steps)[1]
 
-    with stage("observations of the environment", count):
+    with stage(f"{count:,} observations of the environment"):
         found = np.asarray(run(report_keys(_RECORDED_AT_ONCE)))
     obs = found.reshape(-1, found.shape[-1])[:count]
     if portable_policy(checkpoint, setup.env).is_choice:

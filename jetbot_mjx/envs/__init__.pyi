@@ -38,6 +38,7 @@ from .mujoco_simulator import Numerics as Numerics
 from .mujoco_simulator import in_mujoco as in_mujoco
 from .opengl import SceneRenderer as SceneRenderer
 from .opengl import find_backend as find_backend
+from .opengl import some_without_gpu as some_without_gpu
 from .own_class import import_class as import_class
 from .program_key import is_built_in as is_built_in
 from .program_key import open_program_cache as open_program_cache

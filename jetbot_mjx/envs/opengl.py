@@ -35,6 +35,9 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), 150)
 
 _PLATFORM = "PYOPENGL_PLATFORM"
 
+_WITHOUT_GPU = ("llvmpipe", "softpipe", "swrast", "swr")
+"""Names of the programs that draw in place of a GPU, as OpenGL tells them."""
+
 _REMEDY_LINUX = (
     "install one of libegl1 with a GPU driver or libegl-mesa0, or"
     " libosmesa6 (Debian and Ubuntu: apt-get install libegl1 libegl-mesa0)"
@@ -73,6 +76,8 @@ class SceneRenderer:
         _end_at_exit()
         self._gl.make_current()
         self._context = mujoco.MjrContext(mj_model, mujoco.mjtFontScale.mjFONTSCALE_50)
+        self.without_gpu = _device().startswith(_WITHOUT_GPU)
+        """Whether the processor draws, which takes a quarter of a second for a frame of a video."""
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
 
     def update_scene(
@@ -148,6 +153,19 @@ _open: "weakref.WeakSet[SceneRenderer]" = weakref.WeakSet()
 def _end_at_exit() -> None:
     """End all contexts before EGL ends, whose own handler the first context has registered."""
     atexit.register(lambda: [renderer.end() for renderer in list(_open)])
+
+
+def some_without_gpu() -> bool:
+    """Return whether the processor draws the images of a renderer that is open."""
+    return any(renderer.without_gpu for renderer in _open)
+
+
+def _device() -> str:
+    """Return what draws in the current context."""
+    # Only now, because the module of the back end tells PyOpenGL which library to load.
+    from OpenGL import GL
+
+    return GL.glGetString(GL.GL_RENDERER).decode().lower()
 
 
 @functools.cache

@@ -208,7 +208,7 @@ class CompiledRollout(Generic[_Results]):
         controllers: Sequence[str],
         programs: ProgramCache,
         label: str = "",
-        robots: str = "",
+        where: str = "",
     ) -> None:
         """Prepare the program, which compiles at its first use.
 
@@ -217,10 +217,10 @@ class CompiledRollout(Generic[_Results]):
           controllers: the names of the controllers.
           programs: the cache of compiled programs for the environment's configuration.
           label: what tells the program from others of these controllers.
-          robots: what to tell the user about the robots.
+          where: what progress says about where they run, such as ` in C MuJoCo`.
         """
         self._run, self._names = jax.jit(run), list(controllers)
-        self._name, self._robots = f"episodes of {self._names}{label}", robots
+        self._name, self._where = f"episodes of {self._names}{label}", where
         self._programs = programs
         self._compiling: dict[int, Callable[[], jax.stages.Compiled]] = {}
         self._compiled: dict[int, jax.stages.Compiled] = {}
@@ -259,10 +259,11 @@ class CompiledRollout(Generic[_Results]):
         arguments = np.int32(index), jax.device_get(params), np.asarray(keys)
         count = len(keys)
         if count not in self._compiled:
-            with stage("compiling the episodes"):
+            with stage(f"compiling the episodes{self._where}"):
                 self.prepare(params, count)
                 self._compiled[count] = self._compiling.pop(count)()
-        with stage(f"episodes, {controller}{self._robots}", count):
+        # One program drives them all, so that none can be counted.
+        with stage(f"{count:,} episodes{self._where}, {controller}"):
             return jax.block_until_ready(self._compiled[count](*arguments))
 
 
@@ -277,6 +278,7 @@ class Evaluator(CompiledRollout[Episodes]):
         *,
         baselines: bool = False,
         record: bool = False,
+        where: str = "",
     ) -> None:
         """Prepare the program, which compiles at its first use.
 
@@ -286,6 +288,7 @@ class Evaluator(CompiledRollout[Episodes]):
           programs: the cache of compiled programs for the environment's configuration.
           baselines: whether `run` can also run the controllers of `BASELINES`.
           record: whether to record trajectories.
+          where: as for `CompiledRollout`.
         """
         controllers = {"policy": policy_controller(networks)}
         if baselines:
@@ -297,7 +300,7 @@ class Evaluator(CompiledRollout[Episodes]):
             [*controllers],
             programs,
             f"{', recorded' if record else ''}{', drawn' if drawn else ''}",
-            " on drawn robots" if drawn else "",
+            f"{where}{' on drawn robots' if drawn else ''}",
         )
 
 

@@ -33,6 +33,8 @@ _ASSETS = Path(__file__).parents[1] / "assets"
 
 _REACHED, _MISSED = "C0", "C1"
 
+_OUTCOMES = ((True, _REACHED, "reached"), (False, _MISSED, "not reached"))
+
 _DPI = 160
 
 
@@ -75,7 +77,8 @@ def plot_trajectories(
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     axes = figure.add_subplot()
     # Draw each trajectory with its goal as a square and its end as a dot.
-    for index in range(episodes.success.size) if which is None else which:
+    drawn = range(episodes.success.size) if which is None else which
+    for index in drawn:
         colour = _REACHED if episodes.success[index] > 0 else _MISSED
         way = np.asarray(episodes.qpos[index, : int(episodes.steps[index]) + 1, :2])
         goal_w = np.asarray(episodes.goal_w[index])
@@ -89,8 +92,10 @@ def plot_trajectories(
     # Add the start, the legend and the limits.
     ink = matplotlib.rcParams["text.color"]
     axes.plot(0, 0, marker=(3, 0, -90), color=ink, ls="", ms=11, label="start, heading +x")
-    axes.plot([], [], color=_REACHED, label="reached")
-    axes.plot([], [], color=_MISSED, label="not reached")
+    reached = {bool(episodes.success[index] > 0) for index in drawn}
+    for outcome, colour, label in _OUTCOMES:
+        if outcome in reached:
+            axes.plot([], [], color=colour, label=label)
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
     reach = 1.1 * max(1.25, float(np.abs(np.asarray(episodes.goal_w)[:, :2]).max()))
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
@@ -205,12 +210,13 @@ def plot_distributions(report: Report) -> Figure:
     left, right = figure.subplots(1, 2)
     radius = report.config.task.success_radius
     bins = np.linspace(0, max(float(remaining.max()), 2 * radius), 61)
+    some = [one for one in _OUTCOMES if one[0] in won]
     left.hist(
-        [remaining[won], remaining[~won]],
+        [remaining[won == outcome] for outcome, _, _ in some],
         bins=bins.tolist(),
         stacked=True,
-        color=[_REACHED, _MISSED],
-        label=["reached", "not reached"],
+        color=[colour for _, colour, _ in some],
+        label=[label for _, _, label in some],
         log=True,
     )
     ink = matplotlib.rcParams["text.color"]

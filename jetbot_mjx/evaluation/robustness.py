@@ -177,6 +177,9 @@ class Sweeper:
         return dict(zip(variants, summaries, strict=True))
 
 
+_IN_MUJOCO = " in C MuJoCo"
+
+
 class MujocoResult(NamedTuple):
     """A `MujocoResult` holds the metrics of a policy in C MuJoCo, on the goals of the report."""
 
@@ -222,13 +225,14 @@ class MujocoEvaluator:
         robots: list[envs.JetBotEnv | DomainRandomizationWrapper] = [simulator]
         if ranges is not None and ranges.drawn:
             robots.append(DomainRandomizationWrapper(simulator, ranges=ranges))
-        self._evaluators = [Evaluator(one, networks, programs) for one in robots]
+        self._evaluators = [Evaluator(one, networks, programs, where=_IN_MUJOCO) for one in robots]
         self._rendered: dict[envs.SceneryKind, Evaluator] = {}
         if pictures and env.camera is not None:
             config, model = env.camera.config, env.mj_model
             for name in get_args(envs.SceneryKind):
                 camera = envs.MujocoCamera(config, model, appearance=name)
-                own = Evaluator(simulator.with_camera(camera), networks, programs)
+                seen = simulator.with_camera(camera)
+                own = Evaluator(seen, networks, programs, where=f"{_IN_MUJOCO}, {name} pictures")
                 self._rendered[name] = own
 
     def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> MujocoResult:
@@ -238,7 +242,7 @@ class MujocoEvaluator:
           params: parameters of the policy.
           keys: one reset key for each episode, such as `report_keys(1024)`.
         """
-        with default_device_cpu(), stage("in C MuJoCo"):
+        with default_device_cpu():
             found = [summarize(one.run(params, keys), self._dt) for one in self._evaluators]
             rendered = {
                 name: summarize(one.run(params, keys[:RENDERED_GOALS]), self._dt)

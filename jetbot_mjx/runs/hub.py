@@ -92,7 +92,7 @@ def download_run(name: str, folder: Path, say: Callable[[str], None] | None = No
         return folder / f"{repository.replace('/', '--')}-{commit[:12]}"
 
     if not (revision and _COMMIT.fullmatch(revision) and place(revision).is_dir()):
-        with _connected(name) as hub:
+        with _connected(name, to="read") as hub:
             revision = hub.repo_info(repository, revision=revision).sha or ""
             if not _COMMIT.fullmatch(revision):
                 raise UserError(f"{name}: the server names no commit, but {clipped(revision)!r}")
@@ -176,7 +176,7 @@ def check_upload(name: str) -> None:
       UserError: as for `upload_run`.
     """
     repository = _upload_target(name)
-    with _connected(name) as hub:
+    with _connected(name, to="write") as hub:
         me, owner = hub.whoami(), repository.partition("/")[0]
         mine = [me["name"], *(one["name"] for one in me.get("orgs", ()))]
         if owner not in mine:
@@ -207,7 +207,7 @@ def upload_run(
         something else, somebody changed it meanwhile, or the Hub refuses or cannot be reached.
     """
     repository = _upload_target(name)
-    with _connected(name) as hub:
+    with _connected(name, to="write") as hub:
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
         url = hub.create_repo(repository, private=private or None, exist_ok=True)
@@ -247,11 +247,12 @@ def _is_ours(path: str) -> bool:
 
 
 @contextlib.contextmanager
-def _connected(name: str) -> Iterator["HfApi"]:
+def _connected(name: str, *, to: str) -> Iterator["HfApi"]:
     """Yield the library's functions, and convert its errors to one line each.
 
     Args:
       name: the name of the repository, for the messages.
+      to: what the token must allow, `read` or `write`, for the messages.
 
     Raises:
       NotFoundError: there is no such repository or revision.
@@ -265,7 +266,7 @@ def _connected(name: str) -> Iterator["HfApi"]:
         raise UserError(f"{name}: HF_ENDPOINT = {_endpoint()!r} is no address: {error}") from None
     endpoint = _endpoint() or constants.ENDPOINT
     bars = not utils.are_progress_bars_disabled()
-    log_in = "set HF_TOKEN to a token that may, or say `hf auth login`"
+    log_in = f"set HF_TOKEN to a token that may {to} it, or say `hf auth login`"
     utils.disable_progress_bars()
     try:
         yield huggingface_hub.HfApi(endpoint=endpoint, library_name="jetbot_mjx")

@@ -297,7 +297,7 @@ class Search:
         batch = self._batch(key)
         outcomes = self._outcomes(batch, [values for _, values, _ in work], [x[2] for x in work])
         stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
-        with stage("episodes of the report's goals", len(work) * REPORT_GOALS):
+        with stage(f"{len(work) * REPORT_GOALS:,} episodes of the report's goals"):
             episodes = jax.device_get(batch.evaluate(stacked, report_keys(REPORT_GOALS)))
         scores = mean_scores(episodes, outcomes[0].scored_by)
         areas, seconds = [one.area for one in outcomes], mean_seconds(episodes, batch.config)

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from jetbot_mjx import evaluation, runs
-from jetbot_mjx.envs import AdaptedEnv, JetBotEnv
+from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, some_without_gpu
 from jetbot_mjx.errors import UserError, check_count
 from jetbot_mjx.terminal import Advance, stage
 from jetbot_mjx.viewers.environment_video import (
@@ -328,6 +328,7 @@ def write_video(
             yield frame
             advance(1)
 
-    with stage("frames", total) as advance, runs.writing_to(path):
+    slowly = " (slow: the processor draws, as no GPU has OpenGL here)" * some_without_gpu()
+    with stage(f"frames{slowly}", total) as advance, runs.writing_to(path):
         write_mp4(path, join(watched(*one, advance) for one in zip(videos, shown, strict=True)))
     return list(join(shown[:_GIF_EPISODES], FADE_FRAMES // GIF_STRIDE))

@@ -2,7 +2,10 @@
 
 import subprocess
 import sys
+import weakref
+from unittest import mock
 
+import mujoco
 import pytest
 
 from jetbot_mjx.envs import opengl
@@ -68,3 +71,22 @@ def test_without_opengl_the_remedy_is_one_of_this_system(monkeypatch, system, sa
     with pytest.raises(UserError, match=said) as caught:
         opengl.find_backend.__wrapped__()
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("device", "without_gpu"),
+    [("llvmpipe (LLVM 15.0.6, 256 bits)", True), ("NVIDIA H100 80GB HBM3/PCIe/SSE2", False)],
+)
+def test_a_renderer_tells_whether_the_processor_draws(monkeypatch, device, without_gpu):
+    for name in ("MjrContext", "MjvScene", "mjr_setBuffer"):
+        monkeypatch.setattr(opengl.mujoco, name, mock.Mock())
+    monkeypatch.setattr(opengl, "_import_back_end", mock.Mock())
+    monkeypatch.setattr(opengl, "_open", weakref.WeakSet())
+    # PyOpenGL loads a library when it is imported, and there may be none.
+    fake = mock.Mock(**{"glGetString.return_value": device.encode()})
+    monkeypatch.setitem(sys.modules, "OpenGL", mock.Mock(GL=fake))
+    assert not opengl.some_without_gpu()
+    renderer = opengl.SceneRenderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 1)
+    assert opengl.some_without_gpu() is without_gpu
+    renderer.end()
+    assert not opengl.some_without_gpu()

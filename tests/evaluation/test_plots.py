@@ -75,6 +75,19 @@ def test_a_policy_without_a_success_has_no_path_efficiency_to_show():
     assert sum(bar.get_height() for bar in left.patches) == 2
 
 
+@pytest.mark.parametrize(
+    ("won", "wanted"),
+    [([1, 1], ["reached"]), ([0, 0], ["not reached"]), ([0, 1], ["reached", "not reached"])],
+)
+def test_legends_list_what_the_plots_show(won, wanted):
+    episodes = make_episodes([[1, 0], [0, 1]], won, qpos=np.zeros((2, 61, 9)))
+    (plan,) = plots.plot_trajectories(episodes).axes
+    distances, _ = plots.plot_distributions(make_report(episodes)).axes
+    assert [text.get_text() for text in plan.get_legend().get_texts()][1:] == wanted
+    labels = [text.get_text() for text in distances.get_legend().get_texts()]
+    assert [label for label in labels if "radius" not in label] == wanted
+
+
 def test_the_reported_policy_is_marked_on_its_learning_curve():
     curve = [CurvePoint(steps, 0.5, 0.4, 0.6, None) for steps in (0, 2048, 4096)]
     report = make_report(make_episodes([[1, 0], [0, 1]], [1, 0]), curve=curve)
