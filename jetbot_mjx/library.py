@@ -231,6 +231,7 @@ def tune(
     trials: int = 64,
     round_size: int = 16,
     confirm: int = 3,
+    objective: "tuning.Objective" = "learning",
     output: str | Path | None = None,
     storage: str | None = None,
     verbose: bool = False,
@@ -243,12 +244,14 @@ def tune(
       config: a configuration: its name, its file or the object.
       overrides: the settings to change before the search, such as `{"ppo.num_envs": 512}`.
       space: the settings to search and their values, such as `{"ppo.learning_rate": {"low": 1e-4,
-        "high": 1e-2, "log": True}}`; the YAML file that holds them; or `"ppo"`, which comes with
-        the package.
+        "high": 1e-2, "log": True}}`; the YAML file that holds them; or `"ppo"` or `"time"`, which
+        come with the package.
       trials: how many trials the study shall have.
       round_size: how many trials to train at once.
       confirm: how many of the best trials to retrain with five new seeds, beside the configuration
-        as given; 0: none, and the trial with the best score is the best.
+        as given; 0: none, and the best trial is the best.
+      objective: what to improve: `learning`, the mean success while learning, or `time`, the time
+        to the goals of policies that reach 99.9 % of them.
       output: the folder of the study and its results; None: a new one,
         `runs/tune-<config>-<date>-<time>`.
       storage: the database of the study; None: SQLite in the folder.
@@ -276,6 +279,7 @@ def tune(
             trials=trials,
             round_size=round_size,
             confirm=confirm,
+            objective=objective,
             storage=storage,
             say=functools.partial(print, flush=True) if verbose else lambda text: None,
         )

@@ -14,8 +14,15 @@ from jetbot_mjx import cli, startup
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx tune", description=__doc__)
     cli.add_config_arguments(parser)
-    what = "YAML file with the settings to search, or `ppo`, which comes with the package"
+    what = "YAML file with the settings to search, or `ppo` or `time`, which come with the package"
     parser.add_argument("--space", type=Path, required=True, metavar="SPACE", help=what)
+    parser.add_argument(
+        "--objective",
+        choices=("learning", "time"),
+        default="learning",
+        help="what to improve: the mean success while learning, or the time to the goals of"
+        " policies that reach 99.9 %% of them (default: learning)",
+    )
     cli.add_count(parser, "--trials", "how many trials the study shall have", default=64)
     cli.add_count(parser, "--round", "how many trials to train at once", most=1024, default=16)
     parser.add_argument(
@@ -57,6 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             trials=options.trials,
             round_size=options.round,
             confirm=options.confirm,
+            objective=options.objective,
             storage=options.storage,
             say=cli.tell,
         )

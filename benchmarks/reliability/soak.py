@@ -3,10 +3,10 @@
 One process trains. At the end of every interval it notes its memory, open files, threads, the
 memory of its device, what its logs grew by, the rate of steps, and the processor time they took. A
 line is fitted to each of them: one drifts if its slope is larger than three times its standard
-error, and changes it by more than a hundredth over the whole time; of files and threads, also by
-more than one. With `--kills`, other trainings are killed at random moments and resumed until they
-end as one that was never disturbed, again and again until there were so many kills, five of six by
-SIGKILL and one by SIGTERM. `--jobs` of them run at a time.
+error, and makes it worse by more than a hundredth over the whole time, files and threads also by
+more than one. Less memory is not worse. With `--kills`, other trainings are killed at random
+moments and resumed until they end as one that was never disturbed, again and again until there were
+so many kills, five of six by SIGKILL and one by SIGTERM. `--jobs` of them run at a time.
 """
 
 import argparse
@@ -115,10 +115,10 @@ def fit(quantity: str, values: Sequence[float]) -> Slope:
     mean, slope = float(used.mean()), float(at @ used / (at @ at))
     rest = used - mean - slope * at
     error = float(np.sqrt(rest @ rest / (len(used) - 2) / (at @ at)))
-    is_certain = abs(slope) > _CERTAIN * error
+    worse = -slope if quantity == "rate" else slope
+    is_certain = worse > _CERTAIN * error
     least = max(_LARGEST_CHANGE * abs(mean), _ONE_MORE * (quantity in _COUNTS))
-    is_much = abs(slope) * len(used) > least
-    return Slope(quantity, mean, slope, error, bool(is_certain and is_much))
+    return Slope(quantity, mean, slope, error, bool(is_certain and worse * len(used) > least))
 
 
 def watch(config: Config, run_dir: Path, seconds: float) -> list[Sample]:

@@ -21,13 +21,16 @@ from jetbot_mjx.tuning.search import (
     Entrant,
     Search,
     completed_trials,
+    format_objective,
     format_score,
     quiet,
+    rank,
     ranked_trials,
+    study_objective,
     study_score,
 )
 from jetbot_mjx.tuning.space import Parameter, Values, with_values
-from jetbot_mjx.tuning.trials import ScoredBy
+from jetbot_mjx.tuning.trials import Objective, ScoredBy
 
 with requires_extra("tune", "tune"):
     import optuna
@@ -73,6 +76,7 @@ def run_search(
     trials: int,
     round_size: int,
     confirm: int,
+    objective: Objective = "learning",
     storage: str | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> TuningResult:
@@ -85,7 +89,8 @@ def run_search(
       trials: how many completed trials the study shall have.
       round_size: how many to train at once.
       confirm: how many of the best trials to retrain with `CONFIRM_SEEDS` new seeds; 0: retrain
-        nothing, and the trial with the best score is the best.
+        nothing, and the best trial is the best.
+      objective: as for `Search`.
       storage: a database URL; None: SQLite in the folder.
       say: called with one line about each round.
 
@@ -95,7 +100,7 @@ def run_search(
     Raises:
       UserError: as for `Search`, its methods `run` and `confirm`, and `write_results`.
     """
-    search = Search(config, space, folder, storage=storage, say=say)
+    search = Search(config, space, folder, objective=objective, storage=storage, say=say)
     search.run(trials, round_size)
     say(f"search finished after {process_seconds():.1f} s")
     entrants = search.confirm(confirm, CONFIRM_SEEDS, round_size)
@@ -105,12 +110,17 @@ def run_search(
 
 
 def best_entrant(entrants: Sequence[Entrant]) -> Entrant:
-    """Return the entrant that learned best from new seeds, on the goals of training."""
-    return max(entrants, key=lambda one: statistics.fmean(one.areas))
+    """Return the entrant that was best with new seeds, on the goals of training."""
+
+    def key(one: Entrant) -> tuple[float, float]:
+        score = statistics.fmean(one.last_scores)
+        return rank(statistics.fmean(one.objectives), score, one.objective)
+
+    return min(entrants, key=key)
 
 
 def best_values(search: Search, entrants: Sequence[Entrant]) -> Values:
-    """Return the values of the best entrant, or if there is none, of the trial with the best score.
+    """Return the values of the best entrant, or if there is none, of the best trial.
 
     Args:
       search: the finished search.
@@ -130,7 +140,7 @@ def write_results(
       folder: an existing folder.
       config: the configuration that the search began from.
       search: the finished search.
-      entrants: the final trainings; if there are none, the trial with the best score is the best.
+      entrants: the final trainings; if there are none, the best trial is the best.
 
     Returns:
       The path of `best.yaml`.
@@ -157,20 +167,26 @@ def entrants_table(entrants: Sequence[Entrant]) -> str:
     best = best_entrant(entrants)
     kind = best.scored_by
     unit = " [%]" if kind == "success" else ""
+    learning = " while learning" if best.objective == "learning" else ""
     lines = [
-        f"| | mean {kind} while learning | {kind}{unit} | worst seed{unit} | mean time [s]"
-        " | values |",
+        f"| | {_heading(best.objective, kind)}{learning} | {kind}{unit} | worst seed{unit}"
+        " | mean time [s] | values |",
         "|---|---|---|---|---|---|",
     ]
     for one in entrants:
         values = ", ".join(f"{name.split('.')[-1]} {_short(x)}" for name, x in one.values.items())
         lines.append(
             f"| {one.name}{' (best)' if one is best else ''}"
-            f" | {format_score(statistics.fmean(one.areas), kind)}"
+            f" | {format_objective(statistics.fmean(one.objectives), one.objective, kind)}"
             f" | {_number(statistics.fmean(one.scores), kind)} | {_number(min(one.scores), kind)}"
             f" | {_mean_seconds(one.mean_seconds)} | {values} |"
         )
     return "\n".join(lines)
+
+
+def _heading(objective: Objective, scored_by: ScoredBy) -> str:
+    """Return what the values of an objective are, on the goals of training."""
+    return f"mean {scored_by}" if objective == "learning" else "time when learnt"
 
 
 def _number(score: float, scored_by: ScoredBy) -> str:
@@ -184,17 +200,18 @@ def _mean_seconds(seconds: Sequence[float | None]) -> str:
 
 
 def _trials_table(study: optuna.Study) -> str:
-    kind = study_score(study)
+    kind, objective = study_score(study), study_objective(study)
     unit = " [%]" if kind == "success" else ""
     names = sorted({name for trial in study.trials for name in trial.params})
     lines = [
-        f"| trial | mean {kind} | last {kind}{unit} | mean time [s] | {' | '.join(names)} |",
+        f"| trial | {_heading(objective, kind)} | last {kind}{unit} | mean time [s]"
+        f" | {' | '.join(names)} |",
         "|" + "---|" * (4 + len(names)),
     ]
     for trial in ranked_trials(study):
         values = " | ".join(_short(trial.params.get(name, "-")) for name in names)
         lines.append(
-            f"| {trial.number} | {format_score(trial.value or 0.0, kind)}"
+            f"| {trial.number} | {format_objective(trial.value or 0.0, objective, kind)}"
             f" | {_number(trial.user_attrs[SCORES[kind]], kind)}"
             f" | {_mean_seconds([trial.user_attrs['mean_seconds']])} | {values} |"
         )

@@ -12,6 +12,7 @@ has not used, and evaluated on the report's goals, which chose nothing.
 
 import contextlib
 import functools
+import itertools
 import sqlite3
 import threading
 import time
@@ -29,7 +30,14 @@ from jetbot_mjx.evaluation import REPORT_GOALS, report_keys
 from jetbot_mjx.runs import load_checkpoint, make_folder
 from jetbot_mjx.terminal import stage
 from jetbot_mjx.tuning.space import TRACED, Parameter, Value, Values, with_values
-from jetbot_mjx.tuning.trials import Outcome, ScoredBy, Trials, mean_scores, mean_seconds
+from jetbot_mjx.tuning.trials import (
+    Objective,
+    Outcome,
+    ScoredBy,
+    Trials,
+    mean_scores,
+    mean_seconds,
+)
 
 with requires_extra("tune", "tune"):
     import optuna
@@ -38,7 +46,15 @@ with requires_extra("tune", "tune"):
     from optuna.trial import FrozenTrial
 
 _EVALUATIONS = 8
-"""Number of evaluations of each trial, whose mean success or return is maximised."""
+"""Number of evaluations of each trial; after the second, a trial may be ended early."""
+LEAST_SUCCESS = 0.999
+"""Success rate that a policy must have for its time to count."""
+_STARTUP_TRIALS = 16
+"""Number of trials of each program whose values are random; the first all train to their end."""
+_STARTUP_PROGRAMS = 8
+"""Most programs that are tried before Optuna proposes one."""
+_FAILED_ROUNDS = 8
+"""Number of rounds without a trial that could be trained, after which a search ends."""
 _BEAT_SECONDS = 5
 """Time between two heartbeats of a worker [s]."""
 _STALE_SECONDS = 30
@@ -66,8 +82,9 @@ _DAMAGE = ValueError, LookupError, TypeError, ArithmeticError
 SCORES: Mapping[ScoredBy, str] = {"success": "success_rate", "return": "episode_return"}
 """What a stored trial calls its last score."""
 
-_Final = tuple[float, float, float | None]
-"""Mean score, and on the report score and mean duration [s], of one final training."""
+_Final = tuple[float, float, float, float | None]
+"""Of one final training the value of the objective and the last score, and on the report the score
+and the mean duration [s]."""
 
 _Static = tuple[tuple[str, Value], ...]
 """Names and values of the static settings of trials that one program trains."""
@@ -78,14 +95,17 @@ class Entrant(NamedTuple):
 
     name: str
     values: Values
-    areas: tuple[float, ...]
-    """Mean score over the training, for each seed, on the goals of training."""
+    objectives: tuple[float, ...]
+    """What the search improves, for each seed, on the goals of training."""
+    last_scores: tuple[float, ...]
+    """Success rate or mean return after training, for each seed, on the goals of training."""
     scores: tuple[float, ...]
     """Success rate or mean return after training, for each seed, on the report's goals."""
     mean_seconds: tuple[float | None, ...]
     """Mean duration of the report's episodes [s], for each seed; a failed one counts in full. None
     in an environment of one's own."""
     scored_by: ScoredBy = "success"
+    objective: Objective = "learning"
 
 
 @contextlib.contextmanager
@@ -125,6 +145,7 @@ class Search:
         space: Sequence[Parameter],
         folder: Path,
         *,
+        objective: Objective = "learning",
         storage: str | None = None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
@@ -134,6 +155,8 @@ class Search:
           config: the configuration in which settings are changed.
           space: the settings and their values.
           folder: where the study and its results are stored.
+          objective: what is improved: `learning`, the mean score while learning, or `time`, the
+            time to the goals of policies that reach `LEAST_SUCCESS`.
           storage: a database URL; None: SQLite in the folder.
           say: called with one line about each round.
 
@@ -142,15 +165,17 @@ class Search:
           UserError: `init_from` is not a run, the folder or the storage cannot be used, or the
             study has another space.
         """
-        _check_config(config)
+        _check_config(config, objective)
         self._config = config
+        self._objective: Objective = objective
         self._space = list(space)
         flat = config.flat()
         # An option of a task may be searched that the configuration does not have.
         self._given = {one.name: _frozen(flat[one.name]) for one in space if one.name in flat}
+        self._programs = self._first_programs()
         self._say = say
         self._batches: dict[_Static, Trials] = {}
-        self._longest_round = 0.0
+        self._longest_round, self._failed = 0.0, 0
         folder = folder.resolve()
         new = not folder.exists()
         make_folder(folder)
@@ -164,7 +189,9 @@ class Search:
                     storage=self._storage,
                     sampler=self._sampler(0),
                     study_name=folder.name,
-                    direction="maximize",
+                    direction="maximize" if objective == "learning" else "minimize",
+                    # Of those at the same step, the worse half of all that were trained ends.
+                    pruner=optuna.pruners.MedianPruner(_STARTUP_TRIALS, n_warmup_steps=1),
                     load_if_exists=True,
                 )
             with self._reports_storage(*_DAMAGE):
@@ -205,7 +232,7 @@ class Search:
         """Run rounds of trials until the study has enough.
 
         Args:
-          trials: how many completed trials the study shall have, those of other workers included.
+          trials: how many trials the study shall have, those of other workers included.
           round_size: how many to train at once.
 
         Raises:
@@ -213,38 +240,77 @@ class Search:
             storage cannot be used.
         """
         with self._reports_storage():
-            done = len(completed_trials(self.study))
+            done = len(finished_trials(self.study))
         with self._reports_storage(), stage("trials", max(0, trials - done)) as advance:
             while (count := min(round_size, self._next_round(trials))) > 0:
                 self._run_round(count, trials)
-                before, done = done, len(completed_trials(self.study))
+                before, done = done, len(finished_trials(self.study))
                 advance(done - before)
 
     def _run_round(self, count: int, trials: int) -> None:
         """Run `count` trials at once, and tell how many of `trials` the study has."""
         began = time.perf_counter()
         with self._alive() as asked:
-            with stage("drawing values", count) as advance:
-                for index in range(count):
-                    asked.append(self.study.ask())
-                    if index == 0:
-                        # Workers that begin at the same time draw different values.
-                        self.study.sampler = self._sampler(asked[0].number)
-                    advance(1)
-                drawn = [{one.name: one.suggest(trial) for one in self._space} for trial in asked]
+            drawn = self._draw(asked, count)
             self._train(asked, drawn)
         failed = [one for one in self._stored(asked) if "error" in one.user_attrs]
         reason = failed[0].user_attrs["error"] if failed else ""
-        if len(failed) == count:
-            raise UserError(f"none of the last {count} trials could be trained, such as: {reason}")
-        done, scored_by = ranked_trials(self.study), study_score(self.study)
-        best = format_score(done[0].value or 0.0, scored_by) if done else "-"
+        self._failed = self._failed + count if len(failed) == count else 0
+        if self._failed >= _FAILED_ROUNDS * count:
+            raise UserError(
+                f"none of the last {self._failed} trials could be trained, such as: {reason}"
+            )
+        done, ranked = len(finished_trials(self.study)), ranked_trials(self.study)
         self._longest_round = max(self._longest_round, time.perf_counter() - began)
+        best = describe_trial(self.study, ranked[0]) if ranked else "-"
         self._say(
-            f"{len(done)} of {trials} trials, best mean {scored_by} {best};"
+            f"{done} of {trials} trials, best {best};"
             f" this round of {count} took {time.perf_counter() - began:.1f} s"
             + (f"; {len(failed)} could not be trained, such as: {reason}" if failed else "")
         )
+
+    def _draw(self, asked: list[optuna.Trial], count: int) -> list[Values]:
+        """Ask Optuna for trials, append them to a list, and return the values of each.
+
+        All have the static settings of the first, so that one program trains them.
+        """
+        drawn: list[Values] = []
+        # Forget the static settings of the round before.
+        self.study.sampler = self._sampler(len(self.study.get_trials(deepcopy=False)))
+        with stage("drawing values", count) as advance:
+            for _ in range(count):
+                asked.append(trial := self.study.ask())
+                if not drawn:
+                    # Workers that begin at the same time draw different values.
+                    self.study.sampler = sampler = self._sampler(trial.number)
+                    program = trial.number // _STARTUP_TRIALS
+                    if program < len(self._programs):
+                        self._fix(self._programs[program], sampler)
+                drawn.append({one.name: one.suggest(trial) for one in self._space})
+                if len(drawn) == 1:
+                    self._fix(trial.params, sampler)
+                advance(1)
+        return drawn
+
+    def _fix(self, values: Mapping[str, Any], sampler: optuna.samplers.BaseSampler) -> None:
+        """Let Optuna draw no other static settings than these."""
+        static = {name: value for name, value in values.items() if name not in TRACED}
+        self.study.sampler = optuna.samplers.PartialFixedSampler(static, sampler)
+
+    def _first_programs(self) -> list[Mapping[str, Any]]:
+        """Return static settings to begin with, as Optuna stores them: the given ones, then others.
+
+        Otherwise the first values that happen to be good would decide for their program.
+        """
+        lists = [one for one in self._space if one.name not in TRACED and one.choices]
+        every = list(itertools.product(*(one.choices for one in lists)))
+        np.random.default_rng(self._config.seed).shuffle(every)
+        given = tuple(self._given.get(one.name) for one in lists)
+        every.sort(key=lambda values: values != given)
+        return [
+            {one.name: one.to_optuna(value) for one, value in zip(lists, values, strict=True)}
+            for values in every[:_STARTUP_PROGRAMS]
+        ]
 
     def confirm(self, count: int, seeds: int, round_size: int) -> list[Entrant]:
         """Retrain the best trials and the given configuration with new seeds.
@@ -284,8 +350,10 @@ class Search:
                     advance(len(part))
         scored_by, entrants = study_score(self.study), []
         for name, found in done.items():
-            areas, scores, seconds = zip(*found, strict=True)
-            entrants.append(Entrant(name, dict(chosen[name]), areas, scores, seconds, scored_by))
+            own, last, scores, seconds = zip(*found, strict=True)
+            entrants.append(
+                Entrant(name, chosen[name], own, last, scores, seconds, scored_by, self._objective)
+            )
         return entrants
 
     def values_of(self, trial: FrozenTrial) -> dict[str, Value]:
@@ -293,19 +361,24 @@ class Search:
         return {one.name: one.from_optuna(trial.params[one.name]) for one in self._space}
 
     def _final(self, work: Sequence[tuple[str, Values, int]], key: _Static) -> list[_Final]:
-        """Train values with seeds; return mean score, and score and time on the report."""
+        """Train values with seeds, and evaluate them on the report."""
         batch = self._batch(key)
         outcomes = self._outcomes(batch, [values for _, values, _ in work], [x[2] for x in work])
         stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
         with stage(f"{len(work) * REPORT_GOALS:,} episodes of the report's goals"):
             episodes = jax.device_get(batch.evaluate(stacked, report_keys(REPORT_GOALS)))
         scores = mean_scores(episodes, outcomes[0].scored_by)
-        areas, seconds = [one.area for one in outcomes], mean_seconds(episodes, batch.config)
-        return list(zip(areas, scores, seconds, strict=True))
+        seconds = mean_seconds(episodes, batch.config)
+        own = [(one.value(self._objective), one.scores[-1]) for one in outcomes]
+        return [(*x, *y) for x, y in zip(own, zip(scores, seconds, strict=True), strict=True)]
 
     def _check_study(self) -> None:
         """Refuse a study that was begun with another space or configuration."""
-        given = {"space": [str(one) for one in self._space], "config": self._config.to_yaml()}
+        given = {
+            "space": [str(one) for one in self._space],
+            "config": self._config.to_yaml(),
+            "objective": self._objective,
+        }
         stored = self.study.user_attrs
         for key, value in given.items():
             if key not in stored:
@@ -327,7 +400,10 @@ class Search:
         """Return a sampler for the trials from a number on."""
         seed = (self._config.seed + number) % 2**32
         return optuna.samplers.TPESampler(
-            seed=seed, multivariate=True, group=True, n_startup_trials=16
+            seed=seed,
+            multivariate=True,
+            group=True,
+            n_startup_trials=_STARTUP_TRIALS * len(self._programs),
         )
 
     @contextlib.contextmanager
@@ -371,7 +447,7 @@ class Search:
         for trial in running:
             if trial._trial_id not in beating:
                 self._storage.record_heartbeat(trial._trial_id)
-        missing = trials - len(completed_trials(self.study)) - len(running)
+        missing = trials - len(finished_trials(self.study)) - len(running)
         return None if missing <= 0 and running else max(missing, 0)
 
     @contextlib.contextmanager
@@ -428,36 +504,60 @@ class Search:
                     self._fail(trial, error)
                 continue
             seeds = [(self._config.seed + trial.number) % 2**32 for trial in trials]
-            outcomes = self._outcomes(batch, [valid[i][1] for i in members], seeds)
+            outcomes = self._outcomes(
+                batch,
+                [valid[i][1] for i in members],
+                seeds,
+                lambda i, outcome, trials=trials: self._goes_on(trials[i], outcome),
+            )
             with stage("storing trials", len(trials)) as advance:
                 for trial, outcome in zip(trials, outcomes, strict=True):
                     self._tell(trial, outcome)
                     advance(1)
 
-    def _tell(self, trial: optuna.Trial, outcome: Outcome) -> None:
+    def _goes_on(self, trial: optuna.Trial, outcome: Outcome) -> bool:
+        """Store how a trial has learned so far, and return whether it may be one of the best."""
         # Another worker may have taken this one for dead, after Ctrl-Z for example.
-        if self._is_running(trial):
-            trial.set_user_attr(SCORES[outcome.scored_by], outcome.scores[-1])
-            trial.set_user_attr("mean_seconds", outcome.mean_seconds)
-            for step, score in enumerate(outcome.scores):
-                trial.report(score, step)
-            self.study.tell(trial, outcome.area)
+        if not self._is_running(trial):
+            return False
+        trial.report(outcome.value(self._objective), len(outcome.scores) - 1)
+        return not trial.should_prune()
+
+    def _tell(self, trial: optuna.Trial, outcome: Outcome) -> None:
+        if not self._is_running(trial):
+            return
+        trial.set_user_attr(SCORES[outcome.scored_by], outcome.scores[-1])
+        trial.set_user_attr("mean_seconds", outcome.mean_seconds)
+        if self._objective == "time":
+            # What misses goals is drawn less, however short its times are.
+            trial.set_constraint("missed goals", LEAST_SUCCESS - outcome.scores[-1])
+        if outcome.params is None:
+            self.study.tell(trial, state=_STATES.PRUNED)
+            return
+        value = outcome.value(self._objective)
+        trial.report(value, len(outcome.scores) - 1)
+        self.study.tell(trial, value)
 
     def _fail(self, trial: optuna.Trial, error: UserError) -> None:
         if self._is_running(trial):
             trial.set_user_attr("error", str(error))
-            self.study.tell(trial, state=_STATES.FAIL)
+            # Optuna learns nothing from a failed trial, and would draw such values again and again.
+            self.study.tell(trial, state=_STATES.PRUNED)
 
     def _is_running(self, trial: optuna.Trial) -> bool:
         return self._storage.get_trial(trial._trial_id).state == _STATES.RUNNING
 
     def _outcomes(
-        self, batch: Trials, drawn: Sequence[Values], seeds: Sequence[int]
+        self,
+        batch: Trials,
+        drawn: Sequence[Values],
+        seeds: Sequence[int],
+        goes_on: Callable[[int, Outcome], bool] = lambda trial, outcome: True,
     ) -> list[Outcome]:
-        """Train trials of one group at once."""
+        """Train trials of one group at once; `goes_on` is as for `Trials.run`."""
         values = [{**self._given, **one} for one in drawn]
         try:
-            return batch.run(values, seeds)
+            return batch.run(values, seeds, goes_on)
         # JAX raises a subclass.
         except RuntimeError as error:
             if not ran_out(error):
@@ -507,17 +607,59 @@ def format_score(score: float, scored_by: ScoredBy) -> str:
     return f"{score:.2%}" if scored_by == "success" else f"{score:.2f}"
 
 
+def study_objective(study: optuna.Study) -> Objective:
+    """Return what a study improves."""
+    return "time" if study.direction == optuna.study.StudyDirection.MINIMIZE else "learning"
+
+
+def format_objective(value: float, objective: Objective, scored_by: ScoredBy) -> str:
+    """Return what a search improves as text."""
+    return f"{value:.3f} s" if objective == "time" else format_score(value, scored_by)
+
+
+def describe_trial(study: optuna.Study, trial: FrozenTrial) -> str:
+    """Return the value of a trial, and what it is, in a few words."""
+    objective, scored_by = study_objective(study), study_score(study)
+    text = format_objective(trial.value or 0.0, objective, scored_by)
+    if objective == "learning":
+        return f"mean {scored_by} {text}"
+    return f"mean time {text} with {trial.user_attrs[SCORES['success']]:.2%} success"
+
+
 def completed_trials(study: optuna.Study) -> list[FrozenTrial]:
     """Return the trials that were trained to their end."""
     return study.get_trials(deepcopy=False, states=(_STATES.COMPLETE,))
 
 
+def finished_trials(study: optuna.Study) -> list[FrozenTrial]:
+    """Return the trials that were trained to their end or ended early."""
+    ended = study.get_trials(deepcopy=False, states=(_STATES.COMPLETE, _STATES.PRUNED))
+    return [trial for trial in ended if "error" not in trial.user_attrs]
+
+
 def ranked_trials(study: optuna.Study) -> list[FrozenTrial]:
     """Return the trials that were trained to their end, the best first."""
-    return sorted(completed_trials(study), key=lambda trial: -(trial.value or 0.0))
+    objective = study_objective(study)
+
+    def key(trial: FrozenTrial) -> tuple[float, float]:
+        score = trial.user_attrs.get(SCORES["success"], 0.0)
+        return rank(trial.value or 0.0, score, objective)
+
+    return sorted(completed_trials(study), key=key)
 
 
-def _check_config(config: Config) -> None:
+def rank(value: float, score: float, objective: Objective) -> tuple[float, float]:
+    """Return a key that sorts the best first.
+
+    Args:
+      value: the value of the objective.
+      score: the success rate after training, which for `time` must reach `LEAST_SUCCESS`.
+      objective: what is improved.
+    """
+    return (0.0, -value) if objective == "learning" else (max(0.0, LEAST_SUCCESS - score), value)
+
+
+def _check_config(config: Config, objective: Objective) -> None:
     """Raise an error if trials cannot be trained as a configuration asks for.
 
     Raises:
@@ -532,6 +674,11 @@ def _check_config(config: Config) -> None:
         raise ConfigError(
             f"seeds = {config.seeds} cannot be tuned: leave it out. Every trial has a seed of its"
             " own, and the best trials are retrained with new seeds"
+        )
+    if objective == "time" and config.environment is not None:
+        raise ConfigError(
+            f"--objective time is for goals of robots, and environment = {config.environment!r}:"
+            " leave it out, and the mean return counts"
         )
     if config.init_from is not None:
         load_checkpoint(config.init_from)

@@ -7,7 +7,7 @@ run one group after the other.
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -37,7 +37,10 @@ Traced = Mapping[str, Float[Array, "*trials"]]
 
 
 ScoredBy = Literal["success", "return"]
-"""What trials are compared by: the success rate, or the mean return where there is none."""
+"""What a policy is scored by: the success rate, or the mean return where there is none."""
+
+Objective = Literal["learning", "time"]
+"""What a search improves: the mean score while learning, or the time to the goals at the end."""
 
 
 class Outcome(NamedTuple):
@@ -50,13 +53,19 @@ class Outcome(NamedTuple):
     """Mean duration of the last evaluation's episodes [s]; a failed one counts in full. None in an
     environment of one's own."""
     params: PyTree
-    """The last parameters of the policy, on the host."""
+    """The last parameters of the policy, on the host; None if the trial was ended early."""
     scored_by: ScoredBy = "success"
 
-    @property
-    def area(self) -> float:
-        """Return the mean of the scores, which rewards learning early and well."""
-        return float(np.mean(self.scores))
+    def value(self, objective: Objective) -> float:
+        """Return what a search improves.
+
+        For `learning`, that is the mean of the scores, which rewards learning early and well; for
+        `time`, the last mean duration [s].
+        """
+        if objective == "learning":
+            return float(np.mean(self.scores))
+        assert self.mean_seconds is not None
+        return self.mean_seconds
 
 
 class Trials:
@@ -107,19 +116,25 @@ class Trials:
         self._advance = jit(jax.vmap(advance, in_axes=(0, 0, None)), donate_argnums=1)
         self._episodes = jit(jax.vmap(episodes, in_axes=(None, 0, None)))
 
-    def run(self, values: Sequence[Values], seeds: Sequence[int]) -> list[Outcome]:
+    def run(
+        self,
+        values: Sequence[Values],
+        seeds: Sequence[int],
+        goes_on: Callable[[int, Outcome], bool] = lambda trial, outcome: True,
+    ) -> list[Outcome]:
         """Train one policy for each trial, all at once.
 
         Args:
           values: the traced settings of each trial.
           seeds: the seed of each trial.
+          goes_on: asked after each interval but the last with the index of a trial and its outcome
+            so far; if it returns false, the trial ends.
 
         Returns:
           The outcome of each trial.
         """
         count = len(values)
-        # Pad to a power of two, so that few widths are compiled.
-        width = 1 << (count - 1).bit_length()
+        width = self._width(count)
         padded = [values[min(i, count - 1)] for i in range(width)]
         traced = {
             name.removeprefix(SECTION): jnp.asarray([one[name] for one in padded], jnp.float32)
@@ -128,31 +143,36 @@ class Trials:
         keys = jnp.asarray([seeds[min(i, count - 1)] for i in range(width)], jnp.uint32)
         # Train, and evaluate after each interval.
         goals = training_keys(self.config.evaluation.episodes)
-        with stage(f"compiling the training of {width} {'policy' if width == 1 else 'policies'}"):
-            state = self._begin(traced, keys)
-            if width not in self._compiled:
-                state = self._advance(traced, state, np.int32(0))
-                self.evaluate(state.policy_params, goals)
-                self._compiled.add(width)
-        scores, episodes = [], None
+        state = self._prepare(traced, keys, goals)
+        # The trials that still train, by their row of the state.
+        rows, outcomes = dict(enumerate(range(count))), [Outcome((), None, None)] * count
         with stage(f"intervals of training {count} policies", len(self._steps)) as advance:
-            for steps in self._steps:
+            for left, steps in zip(reversed(range(len(self._steps))), self._steps, strict=True):
                 state = self._advance(traced, state, np.int32(steps))
                 episodes = self.evaluate(state.policy_params, goals)
-                scores.append(mean_scores(episodes, self._scored_by))
+                scores = mean_scores(episodes, self._scored_by)
+                seconds = mean_seconds(episodes, self.config)
+                for row, trial in rows.items():
+                    so_far = (*outcomes[trial].scores, scores[row])
+                    outcomes[trial] = Outcome(so_far, seconds[row], None, self._scored_by)
                 advance(1)
-        assert episodes is not None
-        seconds = mean_seconds(episodes, self.config)
+                if not left:
+                    break
+                rows = {row: i for row, i in rows.items() if goes_on(i, outcomes[i])}
+                if not rows:
+                    return outcomes
+                # A quarter of the rows takes a processor a quarter of the time, and another program
+                # to compile; a GPU would not be done much sooner.
+                if 4 * len(rows) <= width and jax.default_backend() == "cpu":
+                    width //= 4
+                    chosen = np.resize([*rows], width)
+                    traced, state = jax.tree.map(lambda x, i=chosen: x[i], (traced, state))
+                    rows = dict(enumerate(rows.values()))
         params = jax.device_get(state.policy_params)
-        return [
-            Outcome(
-                tuple(each[i] for each in scores),
-                seconds[i],
-                jax.tree.map(lambda x, i=i: x[i], params),
-                self._scored_by,
-            )
-            for i in range(count)
-        ]
+        for row, trial in rows.items():
+            own = jax.tree.map(lambda x, i=row: x[i], params)
+            outcomes[trial] = outcomes[trial]._replace(params=own)
+        return outcomes
 
     def evaluate(self, params: PyTree, keys: UInt32[Array, "n 2"]) -> Episodes | ReturnEpisodes:
         """Run deterministic episodes of several policies.
@@ -165,6 +185,27 @@ class Trials:
           The episodes, with the axes (policies, n).
         """
         return self._episodes(0, params, keys)
+
+    def _width(self, count: int) -> int:
+        """Return how many policies to train for so many trials."""
+        if jax.default_backend() != "cpu" and (wider := [x for x in self._compiled if x >= count]):
+            # A GPU trains them about as fast, and nothing is compiled.
+            return min(wider)
+        # A power of two, so that few widths are compiled.
+        return 1 << (count - 1).bit_length()
+
+    def _prepare(
+        self, traced: Traced, seeds: UInt32[Array, " n"], goals: UInt32[Array, "n 2"]
+    ) -> TrainState:
+        """Return the stacked states before the first step, with compiled programs for them."""
+        width = len(seeds)
+        with stage(f"compiling the training of {width} {'policy' if width == 1 else 'policies'}"):
+            state = self._begin(traced, seeds)
+            if width not in self._compiled:
+                state = self._advance(traced, state, np.int32(0))
+                self.evaluate(state.policy_params, goals)
+                self._compiled.add(width)
+            return state
 
     def _begin(self, traced: Traced, seeds: UInt32[Array, " n"]) -> TrainState:
         """Return the stacked states before the first step."""

@@ -39,6 +39,9 @@ GROWING = np.arange(200.0)
         ("threads", [70] * 120 + [71] * 80, False),  # up and down by one
         ("threads", [50 + x // 60 for x in range(200)], True),
         ("rate", 1e6 * (1 - 0.001 * GROWING), True),
+        ("rate", 1e6 * (1 + 0.001 * GROWING), False),
+        ("memory", 1e9 + NOISE - 200_000 * GROWING, False),
+        ("work", 40 * (1 + 0.001 * GROWING), True),
         ("rate", 1e6 * (1 - 0.00001 * GROWING), False),  # certain, and too little to matter
         ("device_memory", np.zeros(200), False),
     ],

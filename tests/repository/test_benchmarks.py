@@ -21,7 +21,7 @@ from benchmarks import RESULTS, ROOT, steps_per_second
 from benchmarks.harness import processes, readme_table, results, timing
 from benchmarks.harness.measurements import Sizes
 from benchmarks.harness.timing import make_row
-from benchmarks.learning import randomization, search_floor, seeds
+from benchmarks.learning import randomization, search_floor, seeds, worst_goal
 from benchmarks.reliability import regressions, robot_fidelity
 from benchmarks.throughput import (
     adapters,
@@ -234,6 +234,34 @@ def test_the_search_from_the_shipped_camera_costs_what_the_page_says(capsys):
         assert figure.lstrip("+").replace("%", " %") in page
     with pytest.raises(UserError, match="no best-known times for these settings"):
         search_floor.main(["--config", "camera_real"])
+
+
+def test_the_worst_goal_is_the_nearest_one_missed_or_else_the_slowest():
+    places = np.array([[1.0, 0.0], [0.0, -0.5], [0.3, 0.3], [-0.4, 0.0]])
+    steps, least = np.array([80.0, 60.0, 256.0, 90.0]), np.array([70.0, 40.0, 30.0, 50.0])
+    reached = np.array([True, True, False, False])
+    missed = worst_goal.Goals(places, reached, steps, least)
+    assert missed.worst == 3
+    found = worst_goal.as_json(missed, 0.01)
+    assert found["missed"] == 2
+    assert found["missed_goals"] == [[0.3, 0.3], [-0.4, 0.0]]
+    assert "2 of 4 goals missed; the worst lies 0.40 m away at 180°, and is missed" in (
+        worst_goal.describe(found)
+    )
+    slow = worst_goal.Goals(places, np.ones(4, bool), steps, least)
+    assert slow.worst == 2
+    assert worst_goal.as_json(slow, 0.01)["worst"] == {
+        "goal": [0.3, 0.3],
+        "distance": 0.424,
+        "bearing": 45.0,
+        "reached": True,
+        "seconds": 2.56,
+        "bound": 0.3,
+    }
+    ways = [np.zeros((3, 2))] * 2
+    figure = worst_goal.plot(["one", "other"], [missed, slow], ways)
+    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert labels == ["2 missed", "drive to the worst"]
 
 
 def test_the_table_holds_the_median_time_and_the_worst_success_of_all_seeds():

@@ -11,6 +11,7 @@ import optuna
 import pytest
 import sqlalchemy.exc
 
+from helpers import point_mass
 from helpers.own_robots import load_robot
 from helpers.quick_trials import Quick
 from helpers.stages import noted_stages
@@ -19,14 +20,16 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.terminal import progress
 from jetbot_mjx.tuning import results, search
 from jetbot_mjx.tuning.space import Parameter
+from jetbot_mjx.tuning.trials import Outcome
 
 CONFIG = parse_config({"ppo": {"learning_rate": 1e-3}})
 SPACE = [
     Parameter("ppo.learning_rate", 1e-4, 1e-2, log=True),
     Parameter("ppo.unroll_length", choices=(8, 16)),
 ]
-WAITING, COMPLETE, RUNNING, FAIL = (
-    getattr(optuna.trial.TrialState, name) for name in ("WAITING", "COMPLETE", "RUNNING", "FAIL")
+WAITING, COMPLETE, RUNNING, PRUNED, FAIL = (
+    getattr(optuna.trial.TrialState, name)
+    for name in ("WAITING", "COMPLETE", "RUNNING", "PRUNED", "FAIL")
 )
 
 
@@ -41,15 +44,86 @@ def test_rounds_of_trials_until_there_are_enough(tmp_path):
     one = search.Search(CONFIG, SPACE, tmp_path / "s", say=said.append)
     one.run(10, round_size=4)
     assert [trial.state for trial in one.study.trials] == [COMPLETE] * 10
-    # 4 + 4 + 2, each grouped by unroll length.
-    assert sum(count for _, count, _ in Quick.calls) == 10
-    assert {length for length, _, _ in Quick.calls} == {8, 16}
+    # Each round has one unroll length, and one program trains it.
+    assert [count for _, count, _ in Quick.calls] == [4, 4, 2]
     assert len(said) == 3
     assert "10 of 10 trials" in said[-1]
     # The first trial is the configuration as it was given.
     assert one.study.trials[0].params == {"ppo.learning_rate": 1e-3, "ppo.unroll_length": 16}
     # Each trial has a seed of its own.
     assert len({seed for _, _, seeds in Quick.calls for seed in seeds}) == 10
+
+
+def test_trials_that_will_not_be_among_the_best_end_early(tmp_path, monkeypatch):
+    monkeypatch.setattr(search, "_STARTUP_TRIALS", 8)
+    asked = []
+
+    class Slow(Quick):
+        def train(self, learning_rate, seed, goes_on):
+            # From the second evaluation on; the mean so far falls with the rate.
+            for n in (1, 2, 3):
+                asked.append(n)
+                so_far = Outcome((1 - learning_rate,) * n, 1.0, None)
+                if not goes_on(so_far):
+                    return so_far
+            return so_far._replace(scores=(*so_far.scores, 1 - learning_rate), params={"w": seed})
+
+    monkeypatch.setattr(search, "Trials", Slow)
+    one = search.Search(CONFIG, SPACE, tmp_path / "s")
+    one.run(8, 8)
+    assert {trial.state for trial in one.study.trials} == {COMPLETE}
+    assert asked == [1, 2, 3] * 8
+    one.run(24, 8)
+    pruned = [trial for trial in one.study.trials if trial.state == PRUNED]
+    assert 0 < len(pruned) < 16
+    assert len(one.study.trials) == 24
+    assert {len(trial.intermediate_values) for trial in pruned} <= {2, 3}
+    # Worse than the median of those that were trained to their end by then.
+    rates = sorted(trial.params["ppo.learning_rate"] for trial in one.study.trials[:8])
+    assert all(trial.params["ppo.learning_rate"] > rates[2] for trial in pruned)
+    assert not {trial.number for trial in pruned} & {
+        x.number for x in search.ranked_trials(one.study)
+    }
+
+
+def test_every_program_is_tried_before_the_best_are_varied(tmp_path):
+    space = [*SPACE, Parameter("ppo.num_updates_per_batch", choices=(2, 4))]
+    one = search.Search(CONFIG, space, tmp_path / "s")
+    one.run(64, 16)
+    rounds = [one.study.trials[first : first + 16] for first in range(0, 64, 16)]
+    names = ("ppo.unroll_length", "ppo.num_updates_per_batch")
+    seen = [{tuple(trial.params[name] for name in names) for trial in each} for each in rounds]
+    assert [len(programs) for programs in seen] == [1] * 4
+    given = (CONFIG.ppo.unroll_length, CONFIG.ppo.num_updates_per_batch)
+    assert seen[0] == {given}
+    assert set.union(*seen) == {(8, 2), (8, 4), (16, 2), (16, 4)}
+
+
+def test_the_shortest_time_among_those_that_reach_their_goals(tmp_path, monkeypatch):
+    monkeypatch.setattr(Quick, "scored_as", "time")
+    said = []
+    one = search.Search(CONFIG, SPACE[:1], tmp_path / "s", objective="time", say=said.append)
+    one.run(40, 8)
+    rates = [trial.params["ppo.learning_rate"] for trial in search.ranked_trials(one.study)]
+    best = min(rate for rate in rates if rate >= 7e-4)
+    assert rates[0] == best
+    # Behind them those that miss goals, although they are faster.
+    assert min(rates) < 7e-4
+    assert rates == sorted(rates, key=lambda rate: (rate < 7e-4, rate))
+    assert f"best mean time {1 + best:.3f} s with 100.00% success" in said[-1]
+    entrants = one.confirm(2, 2, 4)
+    assert results.best_entrant(entrants).values["ppo.learning_rate"] == best
+    table = results.entrants_table(entrants)
+    assert "| | time when learnt | success [%] |" in table
+    assert f"trial {search.ranked_trials(one.study)[0].number} (best) | {1 + best:.3f} s |" in table
+    with pytest.raises(UserError, match="with another objective: choose a new --output"):
+        search.Search(CONFIG, SPACE[:1], tmp_path / "s")
+
+
+def test_an_environment_has_no_time_to_improve(tmp_path):
+    with pytest.raises(UserError, match=r"^--objective time is for goals of robots, and environm"):
+        search.Search(point_mass.config(), SPACE[:1], tmp_path / "s", objective="time")
+    assert not (tmp_path / "s").exists()
 
 
 def test_a_study_goes_on(tmp_path):
@@ -97,13 +171,13 @@ def test_values_that_do_not_fit_together_fail_with_their_reason(tmp_path):
         trial = one.study.ask()
         one._train([trial], [{each.name: each.suggest(trial) for each in space}])
     (stored,) = one.study.trials
-    assert stored.state == FAIL
+    assert search.finished_trials(one.study) == []
     assert "is not a multiple of num_envs" in stored.user_attrs["error"]
 
 
 def test_a_search_in_which_nothing_fits_ends(tmp_path):
     space = [Parameter("ppo.batch_size", choices=(24,))]
-    with pytest.raises(UserError, match="none of the last 4 trials could be trained"):
+    with pytest.raises(UserError, match="none of the last 32 trials could be trained"):
         search.Search(CONFIG, space, tmp_path / "s").run(4, 4)
 
 
@@ -123,7 +197,8 @@ def test_a_setting_may_be_null_in_the_configuration_or_among_the_choices(tmp_pat
 
 
 @pytest.mark.slow
-def test_choices_may_be_lists(tmp_path):
+def test_choices_may_be_lists(tmp_path, monkeypatch):
+    monkeypatch.setattr(search, "_STARTUP_TRIALS", 3)
     name = "ppo.network.policy_hidden_layer_sizes"
     config = parse_config({"ppo": {"network": {"policy_hidden_layer_sizes": [16]}}})
     space = [SPACE[0], Parameter(name, choices=((16,), (8, 8)))]
@@ -173,7 +248,7 @@ def test_the_trials_of_a_worker_that_hangs_are_run_by_another(tmp_path, monkeypa
     hanging, other = (search.Search(CONFIG, SPACE, tmp_path / "s") for _ in range(2))
     released, asked = threading.Event(), threading.Event()
 
-    def hang(batch, drawn, seeds):
+    def hang(batch, drawn, seeds, goes_on):
         asked.set()
         assert released.wait(60)
         return batch.run([{"ppo.learning_rate": 1e-3}] * len(drawn), seeds)
@@ -218,7 +293,7 @@ def test_an_interrupted_round_is_run_again_at_once(tmp_path, monkeypatch):
     assert [trial.params for trial in again.study.trials if trial.state == COMPLETE] == waiting
 
 
-def interrupted(self, values, seeds):
+def interrupted(self, values, seeds, goes_on):
     raise KeyboardInterrupt
 
 
@@ -226,11 +301,11 @@ def test_a_trial_that_another_worker_took_for_dead_is_left_to_it(tmp_path, monke
     one = search.Search(CONFIG, SPACE, tmp_path / "s")
     run = Quick.run
 
-    def slow(self, values, seeds):
+    def slow(self, values, seeds, goes_on):
         monkeypatch.setattr(Quick, "run", run)
         other = search.Search(CONFIG, SPACE, tmp_path / "s")
         other.study.tell(0, state=FAIL)
-        return run(self, values, seeds)
+        return run(self, values, seeds, goes_on)
 
     monkeypatch.setattr(Quick, "run", slow)
     one.run(2, 2)
@@ -244,15 +319,19 @@ def test_values_that_a_network_refuses_fail_with_their_reason(tmp_path, monkeypa
         self.config, self.names = config, names
 
     monkeypatch.setattr(Quick, "__init__", refuse)
+    monkeypatch.setattr(search, "_STARTUP_TRIALS", 4)
     said = []
     one = search.Search(CONFIG, SPACE, tmp_path / "s", say=said.append)
-    one.run(8, 8)
-    assert len(search.completed_trials(one.study)) == 8
-    assert "could not be trained, such as: eight is too short" in said[0]
+    one.run(16, 4)
+    assert len(search.completed_trials(one.study)) == 16
+    assert {trial.params["ppo.unroll_length"] for trial in one.study.trials} == {8, 16}
+    # A round of which nothing can be trained is told, and the next one draws other values.
+    told = [line for line in said if "4 could not be trained, such as: eight is too short" in line]
+    assert len(told) == len(said) - 4 > 0
 
 
 def test_too_many_trials_for_the_memory_are_told(tmp_path, monkeypatch):
-    def run(self, values, seeds):
+    def run(self, values, seeds, goes_on):
         raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory")
 
     monkeypatch.setattr(Quick, "run", run)
@@ -361,7 +440,7 @@ def test_every_phase_is_a_stage_that_a_command_shows(tmp_path):
         shown.clear()
         entrants = one.confirm(1, 1, 2)
         assert shown[0] == "final trainings"
-        assert "episodes of the report's goals" in shown
+        assert "2,048 episodes of the report's goals" in shown
         shown.clear()
         results.write_results(tmp_path / "s", CONFIG, one, entrants)
         assert shown == ["plots"]
@@ -373,7 +452,7 @@ def test_results_are_written(tmp_path):
     one = search.Search(CONFIG, SPACE, folder)
     one.run(8, 4)
     entrants = one.confirm(2, 3, 4)
-    assert [len(each.areas) for each in entrants] == [3, 3, 3]
+    assert [len(each.objectives) for each in entrants] == [3, 3, 3]
     assert entrants[0].name == "as given"
     # The given configuration, which was the first trial, is not retrained twice.
     assert "trial 0" not in {each.name for each in entrants}

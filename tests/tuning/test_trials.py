@@ -92,10 +92,32 @@ def test_a_trial_does_not_depend_on_its_neighbours(trials, outcomes):
 def test_outcomes_are_measured(trials, outcomes):
     for one in outcomes:
         assert len(one.scores) == 2
-        assert one.area == pytest.approx(np.mean(one.scores))
+        assert one.value("learning") == pytest.approx(np.mean(one.scores))
+        assert one.value("time") == one.mean_seconds
         assert 0 < one.mean_seconds <= 40 / 60 + 1e-6
     stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
     assert trials.evaluate(stacked, report_keys(5)).success.shape == (3, 5)
+
+
+def test_a_trial_that_is_ended_leaves_the_others_as_they_were(trials, outcomes):
+    asked = []
+
+    def goes_on(trial, outcome):
+        asked.append((trial, outcome.scores, outcome.params))
+        return trial == 1
+
+    with noted_stages() as shown:
+        ended, kept, other = trials.run(VALUES, [3, 3, 4], goes_on)
+    assert asked == [(i, outcomes[i].scores[:1], None) for i in range(3)]
+    assert (ended.scores, ended.params) == (outcomes[0].scores[:1], None)
+    assert (other.scores, other.params) == (outcomes[2].scores[:1], None)
+    # One of four rows goes on, alone, by a program of its own.
+    assert kept.scores == outcomes[1].scores
+    for ours, theirs in zip(leaves(kept.params), leaves(outcomes[1].params), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4)
+    assert shown[0] == "compiling the training of 4 policies"
+    first = trials.run(VALUES, [3, 3, 4], lambda trial, outcome: False)
+    assert [one.scores for one in first] == [one.scores[:1] for one in outcomes]
 
 
 def test_compiling_and_training_are_stages_that_a_command_shows(trials):
