@@ -165,7 +165,7 @@ def _device() -> str:
     # Only now, because the module of the back end tells PyOpenGL which library to load.
     from OpenGL import GL
 
-    return GL.glGetString(GL.GL_RENDERER).decode().lower()
+    return (GL.glGetString(GL.GL_RENDERER) or b"").decode().lower()
 
 
 @functools.cache

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from jetbot_mjx.errors import NotFoundError, UserError, os_errors
+from jetbot_mjx.errors import NotFoundError, UserError, os_errors, printable
 from jetbot_mjx.runs.run_dir import CONFIG, occupied, read_config, seed_folders
 from jetbot_mjx.runs.run_finder import (
     PRETRAINED,
@@ -52,11 +52,17 @@ def list_runs(
     found, damaged = chosen(folder or ROOT)
     if as_json:
         return json.dumps([run.to_json() for run in found], indent=2)
-    table = runs_table(found, damaged)
-    if folder:
-        return table
-    shipped = runs_table(*chosen(PRETRAINED))
-    return f"{table}\n\nwith the package, for every command that takes a run:\n{shipped}"
+    shipped = ([], []) if folder else chosen(PRETRAINED)
+    if text and not (found or shipped[0]):
+        return f"no run has {printable(text)!r} in its name or task"
+    tables = []
+    if found or not text:
+        tables.append(runs_table(found, damaged))
+    if shipped[0]:
+        tables.append(
+            f"with the package, for every command that takes a run:\n{runs_table(*shipped)}"
+        )
+    return "\n\n".join(tables)
 
 
 class RunChanges(NamedTuple):

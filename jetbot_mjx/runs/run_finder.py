@@ -5,9 +5,11 @@ if it comes with the package, or as `hf:USER/NAME` if it is on the Hugging Face 
 """
 
 import difflib
+import math
 import os
 import shlex
 import shutil
+import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,7 +25,7 @@ from jetbot_mjx.errors import (
     printable,
 )
 from jetbot_mjx.runs import hub
-from jetbot_mjx.runs.metrics import METRICS, read_history
+from jetbot_mjx.runs.metrics import METRICS, History, read_history
 from jetbot_mjx.runs.run_dir import (
     CONFIG,
     DamagedRunError,
@@ -60,10 +62,12 @@ class RunInfo(NamedTuple):
     """Environment steps of the last line of its log."""
     num_timesteps: int
     """Environment steps it was asked to train for."""
+    seeds: int
     success_rate: float | None
-    """Success rate of the best evaluation; None before the first one, or if none is told."""
+    """Success rate of the best evaluation, of several seeds the mean; None before the first one, or
+    if none is told."""
     episode_return: float | None
-    """Mean return of the best evaluation in an `environment`; None for a robot."""
+    """Mean return of the best evaluation in an `environment`, likewise; None for a robot."""
     changed: float
     """Time of the last line of its log [s since 1970]."""
 
@@ -175,16 +179,14 @@ def read_info(run_dir: Path) -> RunInfo:
     """
     config = read_config(run_dir)
     try:
-        # Of several seeds, show the first.
-        seeds = sorted(run_dir.glob(f"seed-*/{METRICS}"))
-        history = read_history(seeds[0] if seeds else run_dir / METRICS)
+        files = sorted(run_dir.glob(f"seed-*/{METRICS}")) or [run_dir / METRICS]
+        histories = [read_history(file) for file in files]
+        history = min(histories, key=lambda lines: lines[-1].env_steps if lines else 0)
         changed = history[-1].timestamp if history else (run_dir / CONFIG).stat().st_mtime
     except UnreadableError:
         raise
     except (UserError, OSError) as error:
         raise DamagedRunError(run_dir, str(error)) from None
-    rates = [line.metrics.get("eval/success_rate") for line in history]
-    returns = [line.metrics.get("eval/episode_return") for line in history]
     task = f"{clipped(config.task.name, 60)} {config.robot.label} {config.task.observation}"
     own = config.environment
     return RunInfo(
@@ -192,10 +194,22 @@ def read_info(run_dir: Path) -> RunInfo:
         task=task if own is None else clipped(own, 60),
         env_steps=history[-1].env_steps if history else 0,
         num_timesteps=config.ppo.num_timesteps,
-        success_rate=max((x for x in rates if x is not None and 0 <= x <= 1), default=None),
-        episode_return=max((x for x in returns if x is not None), default=None) if own else None,
+        seeds=len(histories),
+        success_rate=_mean_best(histories, "eval/success_rate", most=1.0),
+        episode_return=_mean_best(histories, "eval/episode_return") if own else None,
         changed=changed,
     )
+
+
+def _mean_best(
+    histories: Sequence[Sequence[History]], metric: str, *, most: float = math.inf
+) -> float | None:
+    """Return the mean over all seeds of the best value of a metric; None if one has none."""
+    every = [
+        [x for line in history if (x := line.metrics.get(metric)) is not None and x <= most]
+        for history in histories
+    ]
+    return statistics.fmean(map(max, every)) if all(every) else None
 
 
 def runs_table(runs: Sequence[RunInfo], damaged: Sequence[Unusable] = ()) -> str:
@@ -232,9 +246,10 @@ def _why_not(error: Unusable) -> str:
 
 def format_score(run: RunInfo) -> str:
     """Return the success rate of a run, or its return where it has none."""
+    seeds = f" ({run.seeds} seeds)" if run.seeds > 1 else ""
     if run.success_rate is not None:
-        return f"{run.success_rate:.1%}"
-    return "-" if run.episode_return is None else f"return {run.episode_return:.1f}"
+        return f"{run.success_rate:.1%}{seeds}"
+    return "-" if run.episode_return is None else f"return {run.episode_return:.1f}{seeds}"
 
 
 def copy_pretrained(folder: Path) -> tuple[Path, ...]:

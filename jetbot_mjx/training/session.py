@@ -304,13 +304,24 @@ def _check_folder(training: Training) -> bool:
         )
     # A run that ended before its first checkpoint, for example because memory was too small, may
     # start again with another configuration.
-    if stored.seeds != config.seeds or any(map(checkpoint_steps, runs.seed_dirs(run_dir, stored))):
+    trained = [
+        steps for each in runs.seed_dirs(run_dir, stored) if (steps := checkpoint_steps(each))
+    ]
+    if stored.seeds != config.seeds or trained:
         try:
             stored.check_resume(config)
         except ConfigError as error:
             raise ConfigError(
-                f"{run_dir} holds another run: choose a new --run-dir, or --resume it: {error}"
+                f"{run_dir} holds another run: choose a new --run-dir, or begin with its policy,"
+                f" --init-from {run_dir}: {error}"
             ) from None
+    done = max((steps[-1] for steps in trained), default=0)
+    planned = config.ppo.training_steps * config.ppo.steps_per_training_step
+    if planned < done and config.ppo.num_timesteps != stored.ppo.num_timesteps:
+        raise ConfigError(
+            f"ppo.num_timesteps = {config.ppo.num_timesteps} is fewer than the {done:,} steps that"
+            f" {run_dir} has trained: choose more, or leave it out"
+        )
     return True
 
 

@@ -49,6 +49,28 @@ def test_the_list_is_filtered_sorted_and_printed_as_json(runs, capsys):
     assert out.index("newer") < out.index("older")
 
 
+def test_a_filter_that_nothing_matches_says_so_once(runs, capsys):
+    assert list_runs.main(["--filter", "nothing"]) == 0
+    assert capsys.readouterr().out == "no run has 'nothing' in its name or task\n"
+    # Of those that come with the package, none of the user's.
+    assert list_runs.main(["--filter", "pretrained:best_ego"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["with", "run", "pretrained:best_egocentric"]
+
+
+def test_of_several_seeds_the_mean_is_listed(tmp_path, capsys):
+    run = make_run(tmp_path / "two", seeds=2)
+    for seed, (steps, rate) in enumerate([(200, 0.5), (100, 0.9)]):
+        make_run(run / f"seed-{seed}", (50, 1.0, 0.1), (steps, 2.0, rate))
+    assert list_runs.main([str(tmp_path)]) == 0
+    line = capsys.readouterr().out.splitlines()[1]
+    assert " 100 " in line
+    assert " 70.0% (2 seeds)" in line
+    assert list_runs.main([str(tmp_path), "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)
+    assert (found["seeds"], found["success_rate"]) == (2, pytest.approx(0.7))
+
+
 def test_the_newest_report_is_opened(runs, monkeypatch, capsys):
     with pytest.raises(UserError, match="has no report: write one with `jetbot-mjx evaluate"):
         list_runs.main(["--open", "latest"])

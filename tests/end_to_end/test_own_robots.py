@@ -23,7 +23,13 @@ SETTINGS = (*TINY, "ppo.learning_rate_schedule=NONE")
 """A training that may go on for longer than it was to, and be the same until then."""
 
 MEASURES = """
-robot: {preset: real, wheel_radius: 0.04, wheel_separation: 0.15, chassis_mass: 0.9}
+robot:
+  preset: real
+  wheel_radius: 0.04
+  wheel_separation: 0.15
+  controller_wheel_radius: 0.04
+  controller_wheel_separation: 0.15
+  chassis_mass: 0.9
 task: {observation: egocentric, max_speed: 0.3}
 """
 

@@ -232,8 +232,8 @@ def test_the_line_says_how_far_the_policy_is_from_it():
     found, _ = compare_with("bound", report.config, report.episodes)
     mean = steps.mean() / 60
     assert lower_bound_line(report._replace(lower_bound=found)) == (
-        "within 10.00% of what physics allows (no controller reaches the same goals in less than"
-        f" {mean:.3f} s on average)\n"
+        f"within 10.00% of what physics allows: {1.1 * mean:.3f} s on average, and no controller"
+        f" reaches the same goals in less than {mean:.3f} s\n"
     )
     line = lower_bound_line(report._replace(lower_bound_missing="no bound"))
     assert line == "what physics allows: not known, no bound\n"

@@ -340,7 +340,8 @@ UNREADABLE = {
 def test_a_file_that_cannot_be_read_costs_one_line_and_no_time(run_copy, harm, file):
     folder = find_checkpoint(run_copy, "best")
     path = folder / file
-    harm(next(path.iterdir()) if path.is_dir() else path)
+    # Of several files, the one with the arrays: TensorStore may leave nodes that nothing refers to.
+    harm(max(path.iterdir(), key=lambda one: one.stat().st_size) if path.is_dir() else path)
     said = refused(folder)
     assert len(said) < 400
     assert any(reason in said for reason in ("cannot be read", "damaged", "changed after"))

@@ -778,6 +778,7 @@ def test_settings_that_may_change_on_resume_are_applied_and_stored(run_copy, key
             "policy_hidden_layer_sizes = [32] is not what the run began with, [32, 32]",
         ),
         ("task.options.x=3", "task.options.x = 3 is not what the run began with, None"),
+        ("ppo.num_timesteps=4096", f"ppo.num_timesteps = 4096 is fewer than the {LAST:,} steps"),
     ],
 )
 def test_settings_that_may_not_change_on_resume_are_refused_by_name(run_copy, setting, said):
@@ -789,7 +790,7 @@ def test_settings_that_may_not_change_on_resume_are_refused_by_name(run_copy, se
 def test_the_same_command_with_another_configuration_is_refused(run_copy, smoke):
     arguments = ["--config", smoke, "--run-dir", str(run_copy), "--seed", "3"]
     said = refused(train.main, arguments)
-    assert f"{run_copy} holds another run: choose a new --run-dir, or --resume it" in said
+    assert f"{run_copy} holds another run: choose a new --run-dir, or begin with its policy" in said
     assert "seed = 3 is not what the run began with, 0" in said
 
 
