@@ -18,14 +18,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.parse_args(arguments)
     with startup.exit_on_interrupt():
         from jetbot_mjx.config import load_config, shipped_configs
+        from jetbot_mjx.terminal import text_table
 
+    rows = [("configuration", "robot or environment", "observation", "steps", "environments")]
     for name, path in shipped_configs().items():
         config = load_config(path)
-        print(
-            f"{name:18} {config.robot.label:9} {config.task.observation:11}"
-            f" {config.ppo.num_timesteps:>13,} steps in {config.ppo.num_envs:>6,} environments"
-            f"{', randomized' if config.randomization.drawn else ''}"
+        drawn = " (randomized)" if config.randomization.drawn else ""
+        own = config.environment
+        robot = (
+            (f"{config.robot.label}{drawn}", config.task.observation) if own is None else (own, "")
         )
+        rows.append((name, *robot, f"{config.ppo.num_timesteps:,}", f"{config.ppo.num_envs:,}"))
+    print(text_table(rows, left=3))
     return 0
 
 

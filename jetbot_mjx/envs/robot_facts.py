@@ -12,7 +12,7 @@ import numpy as np
 
 from jetbot_mjx.config import MjcfRobotConfig, RobotConfig
 from jetbot_mjx.envs.adapted_env import AdaptedEnv
-from jetbot_mjx.envs.drive import AckermannDrive, OwnDrive
+from jetbot_mjx.envs.drive import AckermannDrive, DifferentialDrive, OwnDrive
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mjcf_robot import PREFIX
 from jetbot_mjx.envs.robot_trial import Trial, drive_trial, trial_turn
@@ -70,8 +70,8 @@ def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
         yield "turn", f"{trial.turn:.0%} of the yaw rate that is commanded"
     if (reach := reach_on_floor(env.task, height)) is not None:
         yield "goals", f"reached within {1e3 * reach:.3g} mm on the floor"
-    hints = (*_turn_hint(env, trial, _WELL), *_goal_hints(env, trial), *_contact_hint(model))
-    for hint in hints:
+    follows = [*_speed_hint(env, trial, _WELL)] or _turn_hint(env, trial, _WELL)
+    for hint in (*follows, *_goal_hints(env, trial), *_contact_hint(model)):
         yield "hint", hint
 
 
@@ -90,7 +90,31 @@ def training_hints(env: JetBotEnv) -> list[str]:
     if trial is None:
         return []
     contacts = _contact_hint(env.physics.mj_model)
-    return [*_turn_hint(env, trial, _BADLY), *_goal_hints(env, trial), *contacts]
+    follows = [*_speed_hint(env, trial, _BADLY)] or _turn_hint(env, trial, _BADLY)
+    return [*follows, *_goal_hints(env, trial), *contacts]
+
+
+def _speed_hint(env: JetBotEnv, trial: Trial, least: float) -> Iterator[str]:
+    """Yield which radius of the controller would make a robot as fast as it is told.
+
+    Args:
+      env: one environment, unwrapped, whose robot may be one of measures.
+      trial: how the robot follows its commands.
+      least: as for `_turn_hint`, which has the next hint where this one is followed.
+    """
+    drive = env.drive
+    if isinstance(env.robot, MjcfRobotConfig) or not isinstance(drive, DifferentialDrive):
+        return
+    if abs(trial.speed - 1.0) <= least:
+        return
+    fits = float(f"{drive.wheel_radius * trial.speed:.3g}")
+    tried = drive_trial(env.config, env.physics.mj_model, drive._replace(wheel_radius=fits))
+    # Motors that are too weak are so with every radius.
+    if tried is not None and abs(tried.speed - 1.0) <= _WELL:
+        yield (
+            f"the robot drives with {trial.speed:.0%} of the speed that is commanded:"
+            f" robot.controller_wheel_radius = {fits:g} would make that {tried.speed:.0%}"
+        )
 
 
 def _turn_hint(env: JetBotEnv, trial: Trial, least: float) -> Iterator[str]:

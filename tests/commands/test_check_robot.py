@@ -34,6 +34,24 @@ def test_a_configuration_is_checked_with_its_settings(checked):
     assert re.search(r"robot.wheel_separation = 0.4\d would make that (99|10[01])%", printed)
 
 
+def test_a_robot_that_is_faster_than_it_is_told_gets_a_radius_and_then_a_separation(
+    checked, tmp_path
+):
+    file = tmp_path / "mine.yaml"
+    file.write_text("robot: {preset: real, wheel_radius: 0.04}\ntask: {max_speed: 0.3}\n")
+    printed = checked(file)
+    assert "robot drives with 121% of the speed that is commanded" in printed
+    assert "the robot turns with" not in printed
+    radius = float(re.search(r"controller_wheel_radius = ([\d.]+) would make that 100%", printed)[1])
+    assert radius == pytest.approx(1.21 * 0.0325, rel=0.01)
+    printed = checked(file, "--set", f"robot.controller_wheel_radius={radius}")
+    assert "0.3 m/s of task.max_speed = 0.3" in printed
+    assert "robot drives with" not in printed
+    # Weak motors are slow whatever the controller takes their wheels for.
+    weak = ("--set", "robot.max_wheel_speed=5", "--set", "robot.controller_wheel_radius=0.04")
+    assert "robot.controller_wheel_radius" not in checked(file, *weak)
+
+
 def test_what_keeps_a_robot_from_the_farthest_goal_is_told(checked):
     printed = checked("turtlebot")
     assert "goals      reached within 98.5 mm on the floor" in printed
