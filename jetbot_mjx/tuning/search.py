@@ -283,7 +283,7 @@ class Search:
                 if not drawn:
                     # Workers that begin at the same time draw different values.
                     self.study.sampler = sampler = self._sampler(trial.number)
-                    program = trial.number // _STARTUP_TRIALS
+                    program = trial.number // max(count, _STARTUP_TRIALS)
                     if program < len(self._programs):
                         self._fix(self._programs[program], sampler)
                 drawn.append({one.name: one.suggest(trial) for one in self._space})

@@ -86,7 +86,9 @@ def test_trials_that_will_not_be_among_the_best_end_early(tmp_path, monkeypatch)
     }
 
 
-def test_every_program_is_tried_before_the_best_are_varied(tmp_path):
+@pytest.mark.parametrize("startup", [4, 16])
+def test_every_program_is_tried_before_the_best_are_varied(tmp_path, monkeypatch, startup):
+    monkeypatch.setattr(search, "_STARTUP_TRIALS", startup)
     space = [*SPACE, Parameter("ppo.num_updates_per_batch", choices=(2, 4))]
     one = search.Search(CONFIG, space, tmp_path / "s")
     one.run(64, 16)
