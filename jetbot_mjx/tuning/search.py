@@ -185,15 +185,7 @@ class Search:
         try:
             with stage("opening the study"), self._reports_storage(*_OPENING_ERRORS, *_DAMAGE):
                 self._storage = self._open()
-                self.study = optuna.create_study(
-                    storage=self._storage,
-                    sampler=self._sampler(0),
-                    study_name=folder.name,
-                    direction="maximize" if objective == "learning" else "minimize",
-                    # Of those at the same step, the worse half of all that were trained ends.
-                    pruner=optuna.pruners.MedianPruner(_STARTUP_TRIALS, n_warmup_steps=1),
-                    load_if_exists=True,
-                )
+                self.study = self._study(folder.name)
             with self._reports_storage(*_DAMAGE):
                 self._check_study()
                 # Read all trials once, so that a damaged database is refused before any training.
@@ -203,6 +195,18 @@ class Search:
             if new and not any(folder.iterdir()):
                 folder.rmdir()
             raise
+
+    def _study(self, name: str) -> optuna.Study:
+        """Return the study of a name in the database, a new one if there is none."""
+        return optuna.create_study(
+            storage=self._storage,
+            sampler=self._sampler(0),
+            study_name=name,
+            direction="maximize" if self._objective == "learning" else "minimize",
+            # Of those at the same step, the worse half of all that were trained ends.
+            pruner=optuna.pruners.MedianPruner(_STARTUP_TRIALS, n_warmup_steps=1),
+            load_if_exists=True,
+        )
 
     def _open(self) -> optuna.storages.RDBStorage:
         """Return the database, whose tables only one of several workers can create."""
