@@ -42,7 +42,9 @@ def test_a_robot_that_is_faster_than_it_is_told_gets_a_radius_and_then_a_separat
     printed = checked(file)
     assert "robot drives with 121% of the speed that is commanded" in printed
     assert "the robot turns with" not in printed
-    radius = float(re.search(r"controller_wheel_radius = ([\d.]+) would make that 100%", printed)[1])
+    radius = float(
+        re.search(r"controller_wheel_radius = ([\d.]+) would make that 100%", printed)[1]
+    )
     assert radius == pytest.approx(1.21 * 0.0325, rel=0.01)
     printed = checked(file, "--set", f"robot.controller_wheel_radius={radius}")
     assert "0.3 m/s of task.max_speed = 0.3" in printed
