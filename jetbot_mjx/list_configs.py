@@ -24,11 +24,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, path in shipped_configs().items():
         config = load_config(path)
         drawn = " (randomized)" if config.randomization.drawn else ""
-        own = config.environment
-        robot = (
-            (f"{config.robot.label}{drawn}", config.task.observation) if own is None else (own, "")
+        robot, seen = f"{config.robot.label}{drawn}", config.task.observation
+        if config.environment is not None:
+            robot, seen = config.environment, ""
+        rows.append(
+            (name, robot, seen, f"{config.ppo.num_timesteps:,}", f"{config.ppo.num_envs:,}")
         )
-        rows.append((name, *robot, f"{config.ppo.num_timesteps:,}", f"{config.ppo.num_envs:,}"))
     print(text_table(rows, left=3))
     return 0
 
