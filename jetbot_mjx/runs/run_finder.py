@@ -195,18 +195,25 @@ def read_info(run_dir: Path) -> RunInfo:
         env_steps=history[-1].env_steps if history else 0,
         num_timesteps=config.ppo.num_timesteps,
         seeds=len(histories),
-        success_rate=_mean_best(histories, "eval/success_rate", most=1.0),
+        success_rate=_mean_best(histories, "eval/success_rate", 0.0, 1.0),
         episode_return=_mean_best(histories, "eval/episode_return") if own else None,
         changed=changed,
     )
 
 
 def _mean_best(
-    histories: Sequence[Sequence[History]], metric: str, *, most: float = math.inf
+    histories: Sequence[Sequence[History]],
+    metric: str,
+    least: float = -math.inf,
+    most: float = math.inf,
 ) -> float | None:
     """Return the mean over all seeds of the best value of a metric; None if one has none."""
     every = [
-        [x for line in history if (x := line.metrics.get(metric)) is not None and x <= most]
+        [
+            x
+            for line in history
+            if (x := line.metrics.get(metric)) is not None and least <= x <= most
+        ]
         for history in histories
     ]
     return statistics.fmean(map(max, every)) if all(every) else None
