@@ -16,15 +16,15 @@ from jaxtyping import Bool, Float
 from benchmarks.learning.reachable import ERROR_TIME, Limits
 from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ, DifferentialDrive, JetBotEnv, PhysicsState
 
-MARGIN = 1.02
+MARGIN = 1.005
 """Factor between the largest measured value and the limit."""
 
 MARGIN_OF_SPEED = 1.003
 """The same for speeds, which the motors' controller holds closely."""
 
 _MARGIN_OF_ERROR = 1.2
-GROWTH = 0.8  # [rad/s²] by which |ω| may grow faster than by the drift
-_SPIN = 1.6  # largest yaw rate with limits, as a multiple of the commanded one; then wheels slip
+GROWTH = 0.9  # [rad/s²] by which |ω| may grow faster than by the drift
+_SPIN = 1.5  # largest yaw rate with limits, as a multiple of the commanded one; then wheels slip
 
 
 class Motion(NamedTuple):

@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     for name, value, what in (
         ("goals", REPORT_GOALS, "number of the report's goals"),
-        ("drives", 4096, "drives in which the limits are measured"),
+        ("drives", 16_384, "drives in which the limits are measured"),
         ("steps", 300, "control steps of a drive, and largest number of steps to a goal"),
         ("divisions", Grid().divisions, "divisions of the largest change of speed in a step"),
         ("headings", Grid().headings, "headings on the circle"),
