@@ -1,7 +1,8 @@
 """List the runs in a folder, the latest first, and the names by which commands find them.
 
 `--open latest` opens the report of a run in the browser, `--compare A B` shows what two runs differ
-in, and `--delete NAME` removes one after a question.
+in, and `--delete NAME` removes one after a question. The success rate is that of the best
+evaluation during the training; `jetbot-mjx evaluate` measures it with more goals.
 """
 
 import sys

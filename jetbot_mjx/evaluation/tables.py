@@ -209,7 +209,7 @@ def pairs_table(comparison: Comparison) -> str:
 
 
 def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
 
 
 def _value(value: float | None, form: str) -> str:

@@ -362,12 +362,23 @@ def read_tree(path: Path, name: str, template: PyTree) -> PyTree:
     # TensorStore reports a damaged folder by many kinds of exception.
     except Exception:
         raise CheckpointError(
-            f"checkpoint {path} cannot be read: a file in {name} is damaged or missing; another"
-            " checkpoint may be intact"
+            f"checkpoint {path} cannot be read: a file in {name} is damaged or missing"
+            f"{_other(path)}"
         ) from None
     if digest(flat) != about[_DIGESTS][name]:
-        raise CheckpointError(f"checkpoint {path} is damaged: {name} changed after it was written")
+        raise CheckpointError(
+            f"checkpoint {path} is damaged: {name} changed after it was written{_other(path)}"
+        )
     return jax.tree.unflatten(jax.tree.structure(template), [flat[key] for key in wanted])
+
+
+def _other(path: Path) -> str:
+    """Return where the latest other checkpoint of the run is, to be added to a message."""
+    try:
+        steps = [each for each in checkpoint_steps(path.parent.parent) if each != int(path.name)]
+    except (UserError, ValueError):  # the message is about something else
+        return ""
+    return f"; another one is {checkpoint_path(path.parent.parent, steps[-1])}" if steps else ""
 
 
 def flatten(tree: PyTree) -> dict[str, PyTree]:

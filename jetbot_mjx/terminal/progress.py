@@ -159,26 +159,31 @@ def _lines(stream: TextIO) -> _Display:
         finished = threading.Event()
 
         def remind() -> None:
-            nonlocal last_line
             if finished.wait(_SECONDS_BEFORE_LINE):
                 return
             say(name if total is None else f"{name}: {total:,}")
             while not finished.wait(_SECONDS_BETWEEN_LINES):
-                now = time.monotonic()
                 # Of stages inside each other, the inner one tells what takes long.
-                if under_way[-1:] == [finished] and now - last_line >= _SECONDS_BETWEEN_LINES:
-                    counted = "" if total is None else f" {done:,} of {total:,},"
-                    say(f"{name}:{counted} {now - began:.0f} s so far")
-                    last_line = now
+                if under_way[-1:] == [finished]:
+                    say_how_far()
 
         def advance(count: int) -> None:
-            nonlocal done, last_line
+            nonlocal done
             done += count
+            if total and done < total:
+                say_how_far()
+
+        def say_how_far() -> None:
+            nonlocal last_line
             now = time.monotonic()
-            if total and done < total and now - last_line >= _SECONDS_BETWEEN_LINES:
-                left = (now - began) * (total - done) / max(done, 1)
-                say(f"{name}: {done:,} of {total:,}, about {left:.0f} s left")
-                last_line = now
+            if now - last_line < _SECONDS_BETWEEN_LINES:
+                return
+            last_line = now
+            counted = "" if total is None else f" {done:,} of {total:,},"
+            if total and done:
+                say(f"{name}:{counted} about {(now - began) * (total - done) / done:.0f} s left")
+            else:
+                say(f"{name}:{counted} {now - began:.0f} s so far")
 
         under_way.append(finished)
         threading.Thread(target=remind, daemon=True).start()

@@ -257,13 +257,15 @@ class RunRecorder(TrainerCallback, contextlib.AbstractContextManager["RunRecorde
             return
         self._awaiting_first_step = False
         self._lap()
-        cache = f"{self.clock.cached} of {self.clock.programs} programs from the cache"
-        # Loading a small program may take longer than compiling it took.
-        if (saved := round(self.clock.saved_seconds, 1)) > 0:
-            cache += f", which saved {saved:.1f} s"
+        cache = ""
+        if self.clock.programs:
+            cache = f" ({self.clock.cached} of {self.clock.programs} programs from the cache"
+            # Loading a small program may take longer than compiling it took.
+            saved = round(self.clock.saved_seconds, 1)
+            cache += f", which saved {saved:.1f} s)" if saved > 0 else ")"
         self.say(
             f"first training step done {process_seconds():.1f} s after the start;"
-            f" {self._compile_seconds:.1f} s of it compiling ({cache})"
+            f" {self._compile_seconds:.1f} s of it compiling{cache}"
         )
 
     def _report_unread(self) -> None:

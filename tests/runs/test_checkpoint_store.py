@@ -253,6 +253,19 @@ def test_a_damaged_checkpoint_does_not_count_as_the_best(run_dir):
     assert checkpoint_steps(run_dir) == [0, 60]
 
 
+def test_the_message_about_a_damaged_checkpoint_names_another_one(run_dir):
+    save(run_dir, 1, 2, 3)
+    for steps in (1, 3):
+        for path in checkpoint_path(run_dir, steps).glob("tree/**/d/*"):
+            path.write_bytes(b"")
+    said = refused(read, run_dir, 3)
+    assert said.endswith(f"; another one is {checkpoint_path(run_dir, 2)}")
+    assert refused(read, run_dir, 1).endswith(str(checkpoint_path(run_dir, 3)))
+    for steps in (2, 3):
+        shutil.rmtree(checkpoint_path(run_dir, steps))
+    assert refused(read, run_dir, 1).endswith("is damaged or missing")
+
+
 def test_a_checkpoint_that_the_disk_cannot_hold_is_not_begun(run_dir, monkeypatch):
     save(run_dir, 1)
     usage = shutil.disk_usage(run_dir)

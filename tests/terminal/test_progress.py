@@ -56,6 +56,20 @@ def test_a_long_stage_tells_how_far_it_is_and_how_long_it_will_take(monkeypatch)
     ]
 
 
+def test_a_stage_that_advances_slowly_tells_how_long_it_will_take(monkeypatch):
+    monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 0.0)
+    monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.2)
+    stream = io.StringIO()
+    with show_progress(stream), stage("frames", 100) as advance:
+        advance(50)
+        deadline = time.monotonic() + 10
+        while stream.getvalue().count("\n") < 3 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    said = [line.split(" s  ")[1] for line in stream.getvalue().splitlines()]
+    assert said[0] == "frames: 100"
+    assert all(re.fullmatch(r"frames: 50 of 100, about \d+ s left", line) for line in said[1:])
+
+
 def test_a_stage_without_a_count_is_printed_again(monkeypatch):
     monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 0.1)
     monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.3)
