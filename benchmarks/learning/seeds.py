@@ -6,7 +6,9 @@
 All seeds of a configuration are trained at once, and their best checkpoints are evaluated. A file
 of variants holds a name for each set of changed settings. The time beside the best-known time is
 the mean over the report's 1,024 fixed goals; there are no best-known times for the fresh goals,
-which no evaluation during training and no report has.
+which no evaluation during training and no report has. Likewise the time above the bound, which is
+what physics allows. The best seed, by success and then by time, drives to the fixed goals in C
+MuJoCo, too.
 """
 
 import argparse
@@ -30,6 +32,7 @@ from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.config.yaml_text import read_yaml
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.report import compare_with
+from jetbot_mjx.evaluation.robustness import MujocoEvaluator
 from jetbot_mjx.runs import Setup, load_checkpoint
 from jetbot_mjx.runs.run_dir import versions, write_json
 
@@ -59,7 +62,10 @@ def measure(config: Config, fresh: int) -> dict[str, Any]:
         seeds = []
         for checkpoint in checkpoints:
             fixed = jax.device_get(evaluator.run(checkpoint.params, fixed_keys))
-            best_known, missing = compare_with("search", config, fixed)
+            gaps = {}
+            for name, kind in (("above_best_known", "search"), ("above_bound", "bound")):
+                found, missing = compare_with(kind, config, fixed)
+                gaps[name] = found.total.gap if found else missing
             unseen = jax.device_get(evaluator.run(checkpoint.params, fresh_keys))
             failed = np.asarray(unseen.goal_w)[np.asarray(unseen.success) == 0][:, :2]
             seeds.append(
@@ -70,18 +76,29 @@ def measure(config: Config, fresh: int) -> dict[str, Any]:
                     "fresh_success_rate": float(np.mean(unseen.success)),
                     "fresh_failed_goals": np.round(failed[:20], 3).tolist(),
                     "seconds": float(np.mean(fixed.steps)) * env.dt,
-                    "above_best_known": best_known.total.gap if best_known else missing,
+                    **gaps,
                 }
             )
-    return {"training_seconds": seconds, "seeds": seeds}
+        ranks = [(seed["success_rate"], -seed["seconds"]) for seed in seeds]
+        best = max(range(len(seeds)), key=ranks.__getitem__)
+        in_mujoco = MujocoEvaluator(setup).run(checkpoints[best].params, fixed_keys).policy
+    return {
+        "training_seconds": seconds,
+        "seeds": seeds,
+        "best_in_mujoco": {
+            "seed": seeds[best]["seed"],
+            "success_rate": in_mujoco.success_rate,
+            "time_to_goal_median": in_mujoco.time_to_goal_median,
+        },
+    }
 
 
 def table(results: Mapping[str, dict[str, Any]]) -> str:
     """Return the median and the worst of each configuration as a Markdown table."""
     lines = [
         "| configuration | seeds | training, all seeds | success (worst) | fresh goals (worst) |"
-        " above best known (worst) |",
-        "|---|---|---|---|---|---|",
+        " above best known (worst) | above the bound (worst) | best seed in C MuJoCo |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name, result in results.items():
         seeds = result["seeds"]
@@ -95,7 +112,8 @@ def table(results: Mapping[str, dict[str, Any]]) -> str:
         lines.append(
             f"| {name} | {len(seeds)} | {result['training_seconds']:.0f} s |"
             f" {spread('success_rate', min, '.2%')} | {spread('fresh_success_rate', min, '.3%')} |"
-            f" {spread('above_best_known', max, '+.2%')} |"
+            f" {spread('above_best_known', max, '+.2%')} | {spread('above_bound', max, '+.1%')} |"
+            f" {result['best_in_mujoco']['success_rate']:.2%} |"
         )
     return "\n".join(lines)
 

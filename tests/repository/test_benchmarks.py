@@ -186,15 +186,22 @@ def test_the_tables_in_the_documentation_are_up_to_date():
 
 
 def test_the_table_of_seeds_holds_the_median_and_the_worst():
-    def one(success, gap):
-        return {"success_rate": success, "fresh_success_rate": success, "above_best_known": gap}
+    def one(success, gap, above_bound):
+        return {
+            "success_rate": success,
+            "fresh_success_rate": success,
+            "above_best_known": gap,
+            "above_bound": above_bound,
+        }
 
-    known = {"training_seconds": 9.0, "seeds": [one(1.0, 0.01), one(0.9, 0.03), one(1.0, 0.02)]}
-    unknown = {"training_seconds": 9.0, "seeds": [one(1.0, "no search was made")]}
+    other = {"training_seconds": 9.0, "best_in_mujoco": {"success_rate": 0.99}}
+    known = {"seeds": [one(1.0, 0.01, 0.1), one(0.9, 0.03, 0.3), one(1.0, 0.02, 0.2)], **other}
+    unknown = {"seeds": [one(1.0, "no search was made", "none")], **other}
     rows = seeds.table({"known": known, "unknown": unknown}).splitlines()[2:]
     assert rows == [
-        "| known | 3 | 9 s | 100.00% (90.00%) | 100.000% (90.000%) | +2.00% (+3.00%) |",
-        "| unknown | 1 | 9 s | 100.00% (100.00%) | 100.000% (100.000%) | - |",
+        "| known | 3 | 9 s | 100.00% (90.00%) | 100.000% (90.000%) | +2.00% (+3.00%)"
+        " | +20.0% (+30.0%) | 99.00% |",
+        "| unknown | 1 | 9 s | 100.00% (100.00%) | 100.000% (100.000%) | - | - | 99.00% |",
     ]
 
 
