@@ -84,6 +84,8 @@ def measure(config: Config, fresh: int) -> dict[str, Any]:
         in_mujoco = MujocoEvaluator(setup).run(checkpoints[best].params, fixed_keys).policy
     return {
         "training_seconds": seconds,
+        "fresh_goals": fresh,
+        "devices": jax.device_count(),
         "seeds": seeds,
         "best_in_mujoco": {
             "seed": seeds[best]["seed"],
