@@ -122,6 +122,11 @@ class PPOConfig(Section):
         return -(-self.num_timesteps // self.steps_per_training_step)
 
     @property
+    def all_steps(self) -> int:
+        """Return `num_timesteps` rounded up to whole training steps."""
+        return self.training_steps * self.steps_per_training_step
+
+    @property
     def updates_per_training_step(self) -> int:
         """Return the number of minibatches of one training step."""
         return self.num_updates_per_batch * self.num_minibatches

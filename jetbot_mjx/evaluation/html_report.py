@@ -93,6 +93,7 @@ def write_report(report: Report) -> Path:
             "replay": replay_command(report.run, report.env_steps, goals),
             "replayed": len(goals),
             "evaluate_command": report.evaluate_command(),
+            "step_cost": report.config.task.step_cost,
             "clips": [(clip, _data_uri(clip.mp4, "video/mp4")) for clip in report.clips],
         },
     )

@@ -24,6 +24,7 @@ def summarize_report(report: Report | ReturnReport) -> str:
     text = (
         f"{_count(report.policy.episodes, 'fixed goal')} (set {GOAL_SET_VERSION}), policy after"
         f" {report.env_steps:,} steps\n{policies_table({'policy': report})}\n"
+        f"{_step_cost_line(report)}"
         f"{best_known_lines(report)}{lower_bound_line(report)}{robustness_table(report)}"
         f"report: {report.folder / 'report.html'}"
     )
@@ -32,6 +33,11 @@ def summarize_report(report: Report | ReturnReport) -> str:
     if report.policy.nonfinite_envs:
         text += f"\n{_count(report.policy.nonfinite_envs, 'episode')} ended in a non-finite state"
     return text
+
+
+def _step_cost_line(report: Report) -> str:
+    cost = report.config.task.step_cost
+    return f"each step costs {cost:g} m of the return\n" if cost else ""
 
 
 def summarize_comparison(comparison: Comparison | ReturnComparison) -> str:

@@ -144,7 +144,8 @@ def _check_networks(source: Checkpoint, config: Config, env: JetBotEnv | Adapted
         if theirs[name] != value:
             raise UserError(
                 f"init_from {source.path}: its network has {name} = {_text(theirs[name])}, and"
-                f" ppo.network.{name} = {_text(value)}: they must be equal"
+                f" ppo.network.{name} = {_text(value)}: give --set ppo.network.{name}="
+                f"{_text(theirs[name])}"
             )
     if source.about["action_size"] != env.action_size:
         raise UserError(
@@ -160,7 +161,9 @@ def _check_networks(source: Checkpoint, config: Config, env: JetBotEnv | Adapted
 
 
 def _text(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    if isinstance(value, bool | None):
+        return {True: "true", False: "false", None: "null"}[value]
+    return f"[{','.join(map(str, value))}]" if isinstance(value, tuple | list) else str(value)
 
 
 def _match_first_layer(params: PyTree, rows: Int[np.ndarray, " new"]) -> PyTree:

@@ -41,9 +41,7 @@ class _LinearRate(float):
     def __new__(cls, initial: float, config: PPOConfig) -> Self:
         rate = super().__new__(cls, initial)
         rate._schedule = optax.linear_schedule(initial, 0.0, config.gradient_steps)
-        rate._gradient_steps_per_step = config.gradient_steps / (
-            config.training_steps * config.steps_per_training_step
-        )
+        rate._gradient_steps_per_step = config.gradient_steps / (config.all_steps)
         return rate
 
     def __call__(self, count: ArrayLike) -> ArrayLike:

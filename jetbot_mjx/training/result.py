@@ -118,7 +118,7 @@ def stop_message(run_dir: Path, run_dirs: Sequence[Path]) -> str:
 def complete_message(config: Config, standings: Sequence[Standing]) -> str:
     """Return the line about a run that has nothing left to train, and how to train it further."""
     steps = min(standing.env_steps for standing in standings)
-    planned = config.ppo.training_steps * config.ppo.steps_per_training_step
+    planned = config.ppo.all_steps
     setting = "ppo.num_timesteps"
     if steps < planned:
         setting = "stop_at_success" if config.stop_at_return is None else "stop_at_return"

@@ -139,7 +139,7 @@ class RunRecorder(TrainerCallback, contextlib.AbstractContextManager["RunRecorde
         """Return whether every seed has made all its steps, or is as good as was asked for."""
         ppo, config = self.config.ppo, self.config
         return all(
-            one.env_steps >= ppo.training_steps * ppo.steps_per_training_step
+            one.env_steps >= ppo.all_steps
             or (
                 one.last is not None
                 and (

@@ -228,7 +228,7 @@ def open_recorder(
         runs.read_history(folder / runs.METRICS, resumed.env_steps) if resumption else []
         for folder in run_dirs
     ]
-    total_steps = config.ppo.training_steps * config.ppo.steps_per_training_step
+    total_steps = config.ppo.all_steps
     terminal = SilentTerminal(total_steps)
     if training.verbose:
         terminal = open_terminal(run_dirs, total_steps, histories)
@@ -316,7 +316,7 @@ def _check_folder(training: Training) -> bool:
                 f" --init-from {run_dir}: {error}"
             ) from None
     done = max((steps[-1] for steps in trained), default=0)
-    planned = config.ppo.training_steps * config.ppo.steps_per_training_step
+    planned = config.ppo.all_steps
     if planned < done and config.ppo.num_timesteps != stored.ppo.num_timesteps:
         raise ConfigError(
             f"ppo.num_timesteps = {config.ppo.num_timesteps} is fewer than the {done:,} steps that"
@@ -384,9 +384,11 @@ def _headline(training: Training) -> str:
             f" {config.task.observation} observation)"
         )
     hints = "".join(f"\nhint: {one}" for one in training.hints)
+    wanted, steps = config.ppo.num_timesteps, config.ppo.all_steps
+    rounded = f" ({wanted:,} rounded up to whole training steps)" if steps != wanted else ""
     return (
         f"training {what} with the {config.trainer} trainer:"
-        f" {config.ppo.num_timesteps:,} steps in {config.ppo.num_envs:,} environments{seeds} on"
+        f" {steps:,} steps{rounded} in {config.ppo.num_envs:,} environments{seeds} on"
         f" {jax.device_count()} x {device.device_kind}{hosts}\nrun folder: {training.run_dir}"
         f"{hints}"
     )

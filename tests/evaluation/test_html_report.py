@@ -142,6 +142,18 @@ def test_one_goal_in_the_terminal(tmp_path):
     assert summarize_comparison(compare(tmp_path, runs)).startswith("2 fixed goals (set 1), 2 pol")
 
 
+def test_a_cost_of_steps_is_told_beside_the_return(tmp_path):
+    report = report_of(tmp_path, np.ones(2))
+    assert "costs" not in summarize_report(report)
+    task = report.config.task.model_copy(update={"step_cost": 0.02})
+    costly = report._replace(config=report.config.model_copy(update={"task": task}))
+    assert "\neach step costs 0.02 m of the return\n" in summarize_report(costly)
+    with unpainted():
+        page = write_report(costly)
+    assert "mean return, 0.02 m less for each step" in page.read_text("utf-8")
+    assert "Each step costs 0.02 m of the return." in page.with_suffix(".md").read_text("utf-8")
+
+
 LOOK = """(() => {
   const width = document.documentElement.clientWidth;
   const scrolls = e =>

@@ -182,8 +182,12 @@ def test_an_observation_of_another_size_is_refused_with_both(tmp_path):
     [
         (
             {"ppo": {"network": {"policy_hidden_layer_sizes": [64, 64]}}},
-            "policy_hidden_layer_sizes = (128, 128, 128), and"
-            " ppo.network.policy_hidden_layer_sizes = (64, 64)",
+            "policy_hidden_layer_sizes = [64,64]: give"
+            " --set ppo.network.policy_hidden_layer_sizes=[128,128,128]",
+        ),
+        (
+            {"ppo": {"network": {"activation": "swish"}}},
+            "ppo.network.activation = swish: give --set ppo.network.activation=tanh",
         ),
         ({"ppo": {"normalize_observations": False}}, "ppo.normalize_observations = true"),
         ({"task": {"observation": "world"}}, "no field of its observation"),
