@@ -465,10 +465,14 @@ def open_page(path: Path) -> None:
         tell("no browser was found: open this file in one")
 
 
-def find_policy(name: str) -> Path:
+def find_policy(name: str, what: Literal["checkpoint", "run"] = "checkpoint") -> Path:
     """Return the path of the run or checkpoint that an argument names, after all are parsed.
 
     Call it before importing what uses the policy: a wrong name is then reported at once.
+
+    Args:
+      name: the argument.
+      what: what the error calls the thing that is missing.
 
     Raises:
       NotFoundError: as for `runs.find_run`, or there is no folder at the path.
@@ -477,11 +481,11 @@ def find_policy(name: str) -> Path:
     with startup.exit_on_interrupt():
         from jetbot_mjx.runs import explain_missing, find_run
     path = find_run(name, say=note)
-    what = f"no checkpoint at {path.absolute()}"
-    with errors.os_errors(what):
+    missing = f"no {what} at {path.absolute()}"
+    with errors.os_errors(missing):
         reason = explain_missing(path.absolute())
     if reason:
-        raise errors.NotFoundError(f"{what}: {reason}")
+        raise errors.NotFoundError(f"{missing}: {reason}")
     return path
 
 

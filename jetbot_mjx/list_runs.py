@@ -50,11 +50,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from jetbot_mjx.runs import changes_table, compare_two, list_runs, newest_report
 
     if options.open:
-        report = newest_report(cli.find_policy(options.open))
+        report = newest_report(cli.find_policy(options.open, "run"))
         cli.tell(f"report: {report}")
         cli.open_page(report)
     elif options.compare:
-        cli.tell(changes_table(compare_two(*map(cli.find_policy, options.compare))))
+        cli.tell(
+            changes_table(compare_two(*(cli.find_policy(name, "run") for name in options.compare)))
+        )
     elif options.delete:
         _delete(options.delete, asks=not options.yes)
     else:
@@ -71,7 +73,7 @@ def _delete(name: str, *, asks: bool) -> None:
     """
     from jetbot_mjx.runs import delete_run, find_deletable
 
-    run = find_deletable(cli.find_policy(name))
+    run = find_deletable(cli.find_policy(name, "run"))
     if asks:
         if not sys.stdin.isatty():
             raise errors.UserError(f"--delete {name}: nobody can be asked here: add --yes")

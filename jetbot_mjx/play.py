@@ -59,7 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run = cli.find_policy(given or f"pretrained:{_DEFAULT_POLICY}")
     trust = options.pop("trust")
     if options.pop("web"):
-        cli.open_page(cli.write_page(run, None, options["which"], trust=trust))
+        page = cli.write_page(run, None, options["which"], trust=trust)
+        if options["opens_page"]:
+            cli.open_page(page)
         return 0
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import play_live

@@ -180,9 +180,11 @@ def _policies(
         networks.value_network.init(value_key),
     )
     found = [("untrained", 0, portable_policy(checkpoint._replace(params=untrained), env))]
-    steps = [one for one in runs.checkpoint_steps(checkpoint.run_dir) if one]
-    if steps and steps[0] < checkpoint.env_steps:
-        early = runs.load_checkpoint(runs.checkpoint_path(checkpoint.run_dir, steps[0]))
+    run = checkpoint.run_dir
+    steps = [one for one in runs.checkpoint_steps(run) if 0 < one < checkpoint.env_steps]
+    if steps:
+        chosen = runs.early_checkpoint({one: runs.stored_score(run, one) for one in steps})
+        early = runs.load_checkpoint(runs.checkpoint_path(run, chosen))
         found.append(("early", early.env_steps, portable_policy(early, env)))
     found.append(("final", checkpoint.env_steps, final))
     return [{"name": name, "env_steps": at, **_stored(policy)} for name, at, policy in found]

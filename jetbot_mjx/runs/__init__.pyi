@@ -5,10 +5,12 @@ from .checkpoint import about_policy as about_policy
 from .checkpoint import find_checkpoint as find_checkpoint
 from .checkpoint import load_checkpoint as load_checkpoint
 from .checkpoint import load_policy as load_policy
+from .checkpoint_store import EARLY_SUCCESS as EARLY_SUCCESS
 from .checkpoint_store import CheckpointStore as CheckpointStore
 from .checkpoint_store import checkpoint_path as checkpoint_path
 from .checkpoint_store import checkpoint_steps as checkpoint_steps
 from .checkpoint_store import digest as digest
+from .checkpoint_store import early_checkpoint as early_checkpoint
 from .checkpoint_store import stored_score as stored_score
 from .hub import RUN_FILES as RUN_FILES
 from .hub import RUN_FOLDERS as RUN_FOLDERS

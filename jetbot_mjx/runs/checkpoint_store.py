@@ -65,6 +65,9 @@ _ABOUT = "about"
 _DIGESTS = "sha256"
 _JOINED = "joined"
 _BYTES = "bytes"
+EARLY_SUCCESS = 0.4
+"""Success rate of a policy early in its training: it drives, and fails visibly."""
+
 _SCORE = "score"
 _STEP_DIGITS = 12
 _SPARE_BYTES = 1_000_000
@@ -414,6 +417,19 @@ def stored_score(run_dir: Path, env_steps: int) -> float:
     except CheckpointError:
         return -math.inf
     return score if isinstance(score, int | float) and math.isfinite(score) else -math.inf
+
+
+def early_checkpoint(success_rates: Mapping[int, float]) -> int:
+    """Choose the checkpoint that shows a policy early in its training.
+
+    Args:
+      success_rates: The success rate of each candidate by its environment steps, in ascending
+        order; at least one.
+
+    Returns:
+      The environment steps of the first one whose rate is closest to `EARLY_SUCCESS`.
+    """
+    return min(success_rates, key=lambda step: abs(success_rates[step] - EARLY_SUCCESS))
 
 
 @contextlib.contextmanager

@@ -299,16 +299,22 @@ _RUN = "a run folder, a checkpoint in it, or a name that `jetbot-mjx runs` lists
 def suggest_run(path: Path, what: str = _RUN) -> str:
     """Return a remedy for a path at which there is no run.
 
+    A similar name is offered: the newest run whose name begins with the path's, at best with a
+    hyphen after it, as in the names that trainings give; else the name that is closest.
+
     Args:
       path: the path.
       what: what to give instead, if no name is similar.
     """
-    names = [_LATEST, *(run.path.name for run in scan_runs()[0])]
-    names += [f"{_PREFIX}{one.name}" for one in PRETRAINED.iterdir()]
+    trained = [run.path.name for run in scan_runs()[0]]
+    names = [_LATEST, *trained, *(f"{_PREFIX}{one.name}" for one in PRETRAINED.iterdir())]
     if path.name == _PREFIX[:-1]:
         return f"write {_PREFIX}NAME, as in {names[-1]}"
     if (run := run_around(path)) and run != path:
         return f"did you mean {shlex.quote(str(shortened(run)))}?"
+    for start in (f"{path.name}-", path.name):
+        if path.name and (newest := next((x for x in trained if x.startswith(start)), None)):
+            return f"did you mean {shlex.quote(newest)}?"
     if close := difflib.get_close_matches(path.name, names, n=1):
         return f"did you mean {close[0]}?"
     return f"give {what}"

@@ -48,7 +48,6 @@ _STRIP_SIDE = 480  # [pixels]
 _HEADING = 22  # [pixels] height of the font
 _STRIP_SPACING = (1.8, 1.8)  # [m] the same for all policies
 _STRIP_ROBOT, _STRIP_MARKER, _STRIP_TRAIL = 18.0, 13.0, 2.0  # [pixels]
-_EARLY_SUCCESS = 0.4  # the early policy is the one closest to this success rate
 _CLOSE = 0.15  # difference of success rates up to which the closest policy is close enough
 
 
@@ -152,7 +151,7 @@ def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
     successes = {
         step: int(grid.reached.sum()) for step, grid in zip(chosen.values(), grids, strict=True)
     }
-    return Rendered(successes, robots, {"image": png}, note_on_early(rates[chosen["early"]]))
+    return Rendered(successes, robots, {"image": png}, note_on_early(rates, chosen["early"]))
 
 
 def _frame_count(grid: RobotGrid) -> int:
@@ -204,19 +203,25 @@ def untrained_early_trained(success_rates: Mapping[int, float]) -> dict[str, int
             f"a strip needs three checkpoints, and the run has {len(steps)}: train with a smaller"
             " checkpoint_interval"
         )
-    early = min(steps[1:-1], key=lambda step: abs(success_rates[step] - _EARLY_SUCCESS))
+    early = runs.early_checkpoint({step: success_rates[step] for step in steps[1:-1]})
     return {"untrained": steps[0], "early": early, "trained": steps[-1]}
 
 
-def note_on_early(success_rate: float) -> str:
+def note_on_early(success_rates: Mapping[int, float], early: int) -> str:
     """Return a line for the user if the early policy of a strip is far from 40 %, else nothing.
 
     Args:
-      success_rate: The success rate of the early policy in its own evaluation.
+      success_rates: The success rate of each checkpoint in its own evaluation, by environment
+        steps.
+      early: The environment steps of the early policy.
     """
-    if abs(success_rate - _EARLY_SUCCESS) <= _CLOSE:
+    if abs(success_rates[early] - runs.EARLY_SUCCESS) <= _CLOSE:
         return ""
+    if max(success_rates.values()) < runs.EARLY_SUCCESS:
+        remedy = "train longer, because none reached that"
+    else:
+        remedy = "train with a smaller checkpoint_interval or ppo.learning_rate"
     return (
-        f"no checkpoint is close to {_EARLY_SUCCESS:.0%} success, the early one has"
-        f" {success_rate:.0%}: train with a smaller checkpoint_interval or ppo.learning_rate"
+        f"no checkpoint is close to {runs.EARLY_SUCCESS:.0%} success, the early one has"
+        f" {success_rates[early]:.0%}: {remedy}"
     )

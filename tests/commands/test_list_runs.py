@@ -137,6 +137,14 @@ def test_only_a_run_of_the_user_is_deleted(runs, arguments, said):
     assert Path("runs/older").is_dir()
 
 
+@pytest.mark.parametrize("action", [["--open"], ["--delete"], ["--compare", "older"]])
+def test_a_name_of_no_run_is_refused_as_such(runs, action):
+    with pytest.raises(
+        UserError, match=r"^no run at .*/old: no such folder; did you mean older\?$"
+    ):
+        list_runs.main([*action, "old"])
+
+
 def test_yes_alone_is_refused(capsys):
     with pytest.raises(SystemExit) as left:
         list_runs.main(["--yes"])

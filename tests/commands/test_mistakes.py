@@ -110,7 +110,7 @@ def home(tmp_path_factory, smoke_run):
     (folder / "empty").mkdir()
     (folder / "runs" / "other").mkdir(parents=True)
     (folder / "runs" / "other" / "thesis.tex").touch()
-    for name in ("mine", "damaged"):
+    for name in ("mine", "damaged", "smoke-20261123-101500"):
         shutil.copytree(smoke_run, folder / "runs" / name)
     shutil.copytree(smoke_run, folder / "runs" / "cut")
     for name in ("theirs", "linked"):

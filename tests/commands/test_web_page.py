@@ -135,9 +135,10 @@ def functions_once(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.usefixtures("functions_once")
 def test_a_page_of_a_run_is_small_and_has_its_policies(here, capfd):
-    # An early checkpoint, one in between, and the last.
+    # One that is as bad as untrained, an early checkpoint, a good one, and the last.
     run, config = here / "run", load_config("jetbot_egocentric")
-    write_untrained_run(run, config, steps=(0, 1024, 4096, 8192))
+    scores = {1024: 0.03, 2048: 0.3, 4096: 0.9}
+    write_untrained_run(run, config, (0, *scores, 8192), scores)
     if jax.__version__ not in stored_hashes() and (reason := wasm.obstacle()):
         pytest.skip(reason)
     assert export.main([str(run), "--format", "web", "--checkpoint", "8192"]) == 0
@@ -148,7 +149,7 @@ def test_a_page_of_a_run_is_small_and_has_its_policies(here, capfd):
     parts = Parts(page.read_text("utf-8"))
     data = parts.data()
     found = [(policy["name"], policy["env_steps"]) for policy in data["policies"]]
-    assert found == [("untrained", 0), ("early", 1024), ("final", 8192)]
+    assert found == [("untrained", 0), ("early", 2048), ("final", 8192)]
     kernels = [policy["layers"][0]["kernel"] for policy in data["policies"]]
     assert len({*kernels}) == 3
     assert page.stat().st_size <= 1.2e6
@@ -292,6 +293,15 @@ def test_without_a_browser_the_file_is_named(here, capfd, monkeypatch):
     monkeypatch.setattr(webbrowser, "open", lambda _: False)
     assert play.main(["--web"]) == 0
     assert "no browser was found: open this file in one" in capfd.readouterr().out
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_browser_that_is_not_wanted_is_neither_opened_nor_missed(browser, here, capfd):
+    assert play.main(["--web", "--no-browser"]) == 0
+    assert not browser
+    told = capfd.readouterr().out
+    assert "runs/pretrained/jetbot_egocentric/page.html" in told
+    assert "browser was found" not in told
 
 
 MODEL = """

@@ -12,8 +12,11 @@ from jetbot_mjx.runs.checkpoint_store import CheckpointStore
 from jetbot_mjx.runs.trust import record_code
 
 
-def write_untrained_run(folder, config: Config, steps=(0,)):
-    """Write a run folder with a checkpoint for each number of steps; returns the environment."""
+def write_untrained_run(folder, config: Config, steps=(0,), scores=None):
+    """Write a run folder with a checkpoint for each number of steps; returns the environment.
+
+    `scores` are the checkpoints' success rates by steps; those that are not given are 0.5.
+    """
     env = make_env(config)
     size, actions = env.observation_size, env.action_size
     networks = make_networks(config.ppo, size, actions)
@@ -21,7 +24,7 @@ def write_untrained_run(folder, config: Config, steps=(0,)):
     record_code(folder, config, None)
     with CheckpointStore(folder, keep=len(steps)) as checkpoints:
         for env_steps in steps:
-            key = jax.random.PRNGKey(env_steps)
+            key, score = jax.random.PRNGKey(env_steps), (scores or {}).get(env_steps, 0.5)
             policy, value = networks.policy_network.init(key), networks.value_network.init(key)
             params = PolicyParams(init_normalizer(size), policy, value)
             trees = {
@@ -29,6 +32,6 @@ def write_untrained_run(folder, config: Config, steps=(0,)):
                     lambda x: np.asarray(x, np.asarray(jnp.asarray(x)).dtype), params
                 )
             }
-            about = about_policy(config, env) | {"metrics": {"success_rate": 0.5}}
-            checkpoints.save(env_steps, trees, about, 0.5)
+            about = about_policy(config, env) | {"metrics": {"success_rate": score}}
+            checkpoints.save(env_steps, trees, about, score)
     return env

@@ -24,6 +24,7 @@ from jetbot_mjx.runs.checkpoint_store import (
     checkpoint_path,
     checkpoint_steps,
     digest,
+    early_checkpoint,
     flatten,
     read_about,
     read_tree,
@@ -456,3 +457,9 @@ def test_a_renamed_checkpoint_is_refused(run_dir):
     save(run_dir, 1)
     checkpoint_path(run_dir, 1).rename(checkpoint_path(run_dir, 2))
     assert "was renamed: it was written after 1 steps" in refused(read, run_dir, 2)
+
+
+def test_the_early_checkpoint_is_the_first_of_those_closest_to_40_percent():
+    assert early_checkpoint({1: 0.03, 2: 0.3, 3: 0.9}) == 2
+    assert early_checkpoint({1: 0.35, 2: 0.9, 3: 0.35}) == 1
+    assert early_checkpoint({1: -np.inf, 2: 1.0}) == 2

@@ -58,6 +58,19 @@ def test_a_missing_run_is_refused_with_the_likely_name(runs):
         find_run("pretrained:x")
 
 
+def test_the_newest_run_of_a_configuration_is_suggested_for_its_name(runs):
+    for age, name in enumerate(["camera_2-20261123-101500", "camera-20261122-101500"]):
+        make_run(runs / "runs" / name, (0, 90.0 - age, 0.1))
+    make_run(runs / "runs" / "camera-20261121-101500", (0, 60.0, 0.1))
+    for given, meant in (
+        ("camera", "camera-20261122-101500"),
+        ("cam", "camera_2-20261123-101500"),
+        ("camera_2", "camera_2-20261123-101500"),
+    ):
+        with pytest.raises(CheckpointError, match=rf"did you mean {meant}\?"):
+            find_checkpoint(given)
+
+
 def test_a_folder_of_runs_says_which_there_are(runs):
     with pytest.raises(CheckpointError, match="it holds 2 runs; name one of newer, older"):
         find_checkpoint("runs")

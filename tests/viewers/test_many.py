@@ -139,12 +139,25 @@ def test_a_strip_shows_the_first_one_that_fails_and_the_last():
     rates = {0: 0.0, 10: 0.05, 20: 0.45, 30: 0.9, 40: 0.4}
     chosen = many.untrained_early_trained(rates)
     assert chosen == {"untrained": 0, "early": 20, "trained": 40}
-    assert many.note_on_early(rates[20]) == ""
-    assert "close to 40% success, the early one has 56%" in many.note_on_early(0.56)
+    assert many.note_on_early(rates, 20) == ""
     shown = many.Rendered({0: 0, 20: 9}, 16, {"image": Path("a.png")}, "a note").describe()
     assert shown.splitlines()[2:] == ["a note", "image: a.png"]
     with pytest.raises(UserError, match="smaller checkpoint_interval"):
         many.untrained_early_trained({0: 0.0, 10: 1.0})
+
+
+@pytest.mark.parametrize(
+    ("rates", "said"),
+    [
+        ({0: 0.0, 10: 0.56, 20: 0.9}, "56%: train with a smaller checkpoint_interval or ppo."),
+        ({0: 0.0, 10: 0.02, 20: 0.95}, "2%: train with a smaller checkpoint_interval or ppo."),
+        ({0: 0.0, 10: 0.02, 20: 0.21, 30: 0.3}, "21%: train longer, because none reached that"),
+    ],
+)
+def test_what_helps_if_no_checkpoint_is_early_is_told(rates, said):
+    early = many.untrained_early_trained(rates)["early"]
+    expected = f"no checkpoint is close to 40% success, the early one has {said}"
+    assert many.note_on_early(rates, early).startswith(expected)
 
 
 def test_many_robots_and_a_strip_are_rendered(
