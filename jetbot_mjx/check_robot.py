@@ -102,7 +102,7 @@ def _tell_cost(env: "JetBotEnv") -> None:
     device = jax.devices()[0].device_kind
     robots = _ROBOTS_WITHOUT_KERNEL if fallbacks else _ROBOTS
     rate = step_rate(env, robots)
-    cli.tell(f"{'rate':10} {float(f'{rate:.2g}'):,.0f} environment steps/s of {robots:,} robots on this {device}")
+    cli.tell(f"{'rate':10} {rate:,.0f} environment steps/s of {robots:,} robots on this {device}")
 
 
 if __name__ == "__main__":

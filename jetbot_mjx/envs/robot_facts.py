@@ -211,12 +211,12 @@ def _may_touch(model: mujoco.MjModel, one: int, other: int) -> bool:
 
 
 def step_rate(env: JetBotEnv | AdaptedEnv, instances: int) -> float:
-    """Return the environment steps per second of many instances on JAX's default device.
+    """Return the environment steps per second of many instances, rounded to two digits.
 
     Args:
       env: one environment, unwrapped. The images of a robot are left out; an environment of one's
         own is in the wrappers of a training.
-      instances: the number of instances.
+      instances: the number of instances, which run on JAX's default device.
     """
     if isinstance(env, AdaptedEnv):
         batch = wrap_for_training(env, env.config.task.episode_length)
@@ -234,4 +234,4 @@ def step_rate(env: JetBotEnv | AdaptedEnv, instances: int) -> float:
     jax.block_until_ready(drive(states))
     begin = time.perf_counter()
     jax.block_until_ready(drive(states))
-    return instances * _STEPS / (time.perf_counter() - begin)
+    return float(f"{instances * _STEPS / (time.perf_counter() - begin):.2g}")

@@ -109,7 +109,7 @@ def describe_environment(config: Config) -> Iterator[tuple[str, str]]:
     with collect():
         rate = step_rate(env, instances)
     device = jax.devices()[0].device_kind
-    yield "rate", f"{float(f'{rate:.2g}'):,.0f} environment steps/s of {instances:,} instances on this {device}"
+    yield "rate", f"{rate:,.0f} environment steps/s of {instances:,} instances on this {device}"
 
 
 def require_sound(env: AdaptedEnv) -> None:
