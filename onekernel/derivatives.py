@@ -234,7 +234,7 @@ class Derivatives:
 
 
 def _is_float(x: Array | ShapedArray | jax.ShapeDtypeStruct) -> bool:
-    return x.dtype == np.float32
+    return x.dtype.kind == "f"
 
 
 def _is_moving(primal: Array, tangent: Array | ad.Zero) -> bool:

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 
-import numpy as np
 from jaxtyping import PyTree
 
 from onekernel.backends import default_backend
@@ -35,8 +34,8 @@ def explain(function: Callable[..., PyTree], *arguments: PyTree, **keywords: PyT
         return
     rows = [
         ("operations", f"{_operations(kernel):,}"),
-        ("reads", f"{_bytes(kernel.argument_shapes):,} bytes an instance"),
-        ("writes", f"{_bytes([x.shape for x in kernel.results()]):,} bytes an instance"),
+        ("reads", f"{4 * sum(kernel.argument_words):,} bytes an instance"),
+        ("writes", f"{4 * sum(kernel.result_words):,} bytes an instance"),
         ("traced and lowered in", f"{seconds:.2f} s"),
     ]
     backend = default_backend()
@@ -58,7 +57,3 @@ def explain(function: Callable[..., PyTree], *arguments: PyTree, **keywords: PyT
 def _operations(kernel: Kernel) -> int:
     programs = (kernel.before, kernel.program, kernel.after)
     return sum(program.size for program in programs if program is not None)
-
-
-def _bytes(shapes: list[tuple[int, ...]]) -> int:
-    return 4 * sum(int(np.prod(shape, dtype=int)) for shape in shapes)

@@ -42,7 +42,7 @@ from jaxtyping import Array, Float, PyTree, UInt8
 
 from onekernel.codegen import require
 from onekernel.errors import KernelError, UnsupportedError
-from onekernel.lower import LateProgram, ScalarProgram, scalarize
+from onekernel.lower import LateProgram, ScalarProgram, bits_of, scalarize
 
 
 def warn_of_fallback(reason: str) -> None:
@@ -94,9 +94,9 @@ class Kernel:
     table: Float[np.ndarray, "rows items"] | None = None
     """The arguments that differ between the items of an instance; None: the kernel is a step."""
     argument_dtypes: Sequence[np.dtype] | None = None
-    """Dtypes of 32 bits of the arguments, whose bits the program takes as float32. XLA passes the
-    arrays as they are: for a CPU it would compile every conversion to a kernel of its own. None:
-    all are float32."""
+    """Dtypes of the arguments, whose bits the program takes as float32: of a number of 64 bits, two
+    along a last axis. XLA passes the arrays as they are: for a CPU it would compile every
+    conversion to a kernel of its own. None: all are float32."""
     result_dtypes: Sequence[np.dtype] | None = None
     """Those of the results, likewise; with a table there are none."""
     identity: str | None = None
@@ -172,6 +172,21 @@ class Kernel:
     @property
     def argument_shapes(self) -> list[tuple[int, ...]]:
         """Return the shapes of the arguments of one instance."""
+        return _without_words(self._taken, self.argument_dtypes)
+
+    @property
+    def argument_words(self) -> list[int]:
+        """Return how many words of 32 bits each argument of one instance has."""
+        return list(map(math.prod, self._taken))
+
+    @property
+    def result_words(self) -> list[int]:
+        """Return how many words of 32 bits each result of one instance has, without a table."""
+        return list(map(math.prod, (self.after or self.program).output_shapes))
+
+    @property
+    def _taken(self) -> list[tuple[int, ...]]:
+        """Return the shapes of the arguments as the first program takes them."""
         shapes = (self.before or self.program).input_shapes
         return shapes if self.table is None else shapes[:-1]
 
@@ -180,12 +195,22 @@ class Kernel:
         if self.table is not None:
             size = self.table.shape[1] * len(self.program.outputs)
             return [jax.ShapeDtypeStruct((*batch, size), np.uint8)]
-        shapes = (self.after or self.program).output_shapes
+        shapes = _without_words((self.after or self.program).output_shapes, self.result_dtypes)
         dtypes = self.result_dtypes or [np.dtype(np.float32)] * len(shapes)
         return [
             jax.ShapeDtypeStruct((*batch, *shape), dtype)
             for shape, dtype in zip(shapes, dtypes, strict=True)
         ]
+
+
+def _without_words(
+    shapes: list[tuple[int, ...]], dtypes: Sequence[np.dtype] | None
+) -> list[tuple[int, ...]]:
+    """Return the shapes of arrays of some dtypes, from those in which programs take them."""
+    if dtypes is None:
+        return shapes
+    pairs = zip(shapes, dtypes, strict=True)
+    return [shape[:-1] if bits_of(dtype) == 64 else shape for shape, dtype in pairs]
 
 
 class Compiled(NamedTuple):
@@ -242,8 +267,7 @@ class Backend(Protocol):
 
         Args:
           kernel: the kernel.
-          leaves: its arguments, arrays of 32 bits of shape (instances, ...), and its table if it
-            has one.
+          leaves: its arguments, arrays of shape (instances, ...), and its table if it has one.
 
         Returns:
           The results, as in `Kernel.results(instances)`.

@@ -1,6 +1,6 @@
 """Make a kernel of a traced function, with another kernel inside it or none.
 
-A kernel takes and returns numbers of 32 bits as they are, and a bool as 0.0 or 1.0. Constants of
+A kernel takes and returns numbers as they are, and a bool as 0.0 or 1.0. Constants of
 the traced function may be arguments of its kernel: their places say which.
 """
 
@@ -16,10 +16,14 @@ from jaxtyping import Array
 
 from onekernel.errors import UnsupportedError
 from onekernel.kernel import Kernel, called_by
-from onekernel.lower import MAX_ARRAY_BYTES, LateProgram, ScalarProgram, scalarize_part
-
-_DTYPES = tuple(map(np.dtype, ("float32", "int32", "uint32", "bool")))
-
+from onekernel.lower import (
+    DTYPES,
+    MAX_ARRAY_BYTES,
+    LateProgram,
+    ScalarProgram,
+    scalarize_part,
+    word_shape,
+)
 
 def kernel_of(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
     """Lower a traced function to a kernel.
@@ -83,7 +87,9 @@ def whole_kernel_of(traced: ClosedJaxpr, places: Sequence[int], *, is_late: bool
         _check_passed(arguments, results)
         return _lower_part(traced, arguments, results)
 
-    shapes = [[x.shape for x in passed_avals(atoms)] for atoms in (arguments, results)]
+    shapes = [
+        [word_shape(x.shape, x.dtype) for x in passed_avals(atoms)] for atoms in (arguments, results)
+    ]
     return Kernel(
         LateProgram(lower, *shapes) if is_late else lower(),
         carried=0,
@@ -108,10 +114,11 @@ def _check_passed(arguments: Sequence[Var], results: Sequence[Var | Literal]) ->
     if not arguments:
         raise UnsupportedError("a function of nothing")
     for dtype in dtypes_of([*arguments, *results]):
-        if dtype not in _DTYPES:
+        if dtype not in DTYPES:
             raise UnsupportedError(f"arguments or results of {dtype}")
     # LLVM takes 10 s for a kernel that reads and writes 10,000 numbers, and 46 s for 40,000.
-    count = 4 * sum(math.prod(x.aval.shape) for x in [*arguments, *results])
+    avals = passed_avals([*arguments, *results])
+    count = sum(x.dtype.itemsize * math.prod(x.shape) for x in avals)
     if count > MAX_ARRAY_BYTES:
         raise UnsupportedError(
             f"arguments and results of {count:,} bytes for each instance, more than"

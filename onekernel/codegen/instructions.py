@@ -10,16 +10,32 @@ import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from onekernel.codegen.writer import LlvmWriter, Value, vector
 from onekernel.errors import UnsupportedError
-from onekernel.lower import COMPARISONS, Expr, is_constant
+from onekernel.lower import COMPARISONS, Expr, is_constant, same_size
 
-ELEMENTS = {"f": "float", "i": "i32", "u": "u32", "b": "i1"}
-"""Type of a scalar by the kind of its dtype."""
+ELEMENTS = {
+    np.dtype(np.float32): "float",
+    np.dtype(np.float64): "double",
+    np.dtype(np.int32): "i32",
+    np.dtype(np.int64): "i64",
+    np.dtype(np.uint32): "u32",
+    np.dtype(np.uint64): "u64",
+    np.dtype(bool): "i1",
+}
+"""Type of a scalar by its dtype."""
 
 _EXTREMES = {"max": "maximum", "min": "minimum"}
 _APPROXIMATIONS = {"exp": "ex2", "log": "lg2", "reciprocal": "rcp"}
-_INTRINSICS = {"abs": "fabs", "floor": "floor", "round": "roundeven", "sqrt": "sqrt"}
+_INTRINSICS = {
+    "abs": "fabs",
+    "floor": "floor",
+    "fma": "fma",
+    "round": "roundeven",
+    "sqrt": "sqrt",
+}
 
 
 class Target(NamedTuple):
@@ -32,9 +48,9 @@ class Target(NamedTuple):
     for_gpu: bool
     """Whether the function is for an NVIDIA GPU."""
 
-    def type(self, kind: str) -> str:
-        """Return the type of a value by the kind of its dtype."""
-        return vector(ELEMENTS[kind], self.writer.lanes)
+    def type(self, dtype: np.dtype) -> str:
+        """Return the type of a value by its dtype."""
+        return vector(ELEMENTS[dtype], self.writer.lanes)
 
 
 _Write = Callable[[Target, Expr, list[Value]], Value]
@@ -70,9 +86,9 @@ def _quotient(on: Target, value: Expr, operands: list[Value]) -> Value:
 
 def _extreme(on: Target, value: Expr, operands: list[Value]) -> Value:
     w = on.writer
-    if on.for_gpu:
+    if on.for_gpu and value.dtype == np.float32:
         # `llvm.maximum` returns NaN if either operand is NaN, as JAX does. GPUs compute it in one
-        # instruction, CPUs do not.
+        # instruction of float32, CPUs do not.
         return w.intrinsic(_EXTREMES[value.op], *operands)
     # A comparison and a selection are one instruction on x86, which returns the second operand if
     # either is NaN. So NaN in the second operand is kept, and NaN in the first one is selected. A
@@ -102,7 +118,7 @@ def _magnitude(on: Target, value: Expr, operands: list[Value]) -> Value:
 
 def _word_sum(on: Target, value: Expr, operands: list[Value]) -> Value:
     a, b = operands
-    if not on.for_gpu:
+    if not on.for_gpu or value.dtype != np.uint32:
         return a + b
     # LLVM's instruction selection for GPUs takes time quadratic in the number of sums with one of
     # the operands, and 13 s for a hundred random numbers from one key.
@@ -138,8 +154,9 @@ def _angle(on: Target, value: Expr, operands: list[Value]) -> Value:
 
 def _logical_shift(on: Target, value: Expr, operands: list[Value]) -> Value:
     """Shift to the right, and fill up with zeros: so an integer without a sign is shifted."""
-    x, by = (operand.to("u32") for operand in operands)
-    return (x >> by).to(ELEMENTS[value.dtype.kind])
+    unsigned = ELEMENTS[same_size("u", value.dtype)]
+    x, by = (operand.to(unsigned) for operand in operands)
+    return (x >> by).to(ELEMENTS[value.dtype])
 
 
 def _select(on: Target, value: Expr, operands: list[Value]) -> Value:
@@ -148,17 +165,17 @@ def _select(on: Target, value: Expr, operands: list[Value]) -> Value:
 
 
 def _convert(on: Target, value: Expr, operands: list[Value]) -> Value:
-    (x,), to = operands, value.dtype.kind
-    if value.operands[0].dtype.kind != "f":
+    (x,), to = operands, value.dtype
+    if value.operands[0].dtype.kind != "f" or to.kind == "f":
         return x.to(ELEMENTS[to])
     # Saturating conversions: numbers beyond the range become its ends and NaN becomes 0, as in JAX,
     # where the plain instruction would be undefined.
-    name = "fptoui.sat" if to == "u" else "fptosi.sat"
+    name = "fptoui.sat" if to.kind == "u" else "fptosi.sat"
     return on.writer.intrinsic(name, x, result=on.type(to))
 
 
 def _bitcast(on: Target, value: Expr, operands: list[Value]) -> Value:
-    return operands[0].bits_as(on.type(value.dtype.kind))
+    return operands[0].bits_as(on.type(value.dtype))
 
 
 _HALF_PI = (math.pi / 2, 6.123233995736766e-17)
@@ -213,6 +230,8 @@ def write_of(value: Expr, *, for_gpu: bool = False) -> _Write:
     write = _OPERATIONS.get((value.op, kind))
     if write is None:
         raise UnsupportedError(f"{value.op} of {value.operands[0].dtype}")
+    if write is _angle and value.dtype != np.float32:
+        raise UnsupportedError(f"{value.op} of {value.dtype}")
     if write is _approximation and not for_gpu:
         raise UnsupportedError(f"an approximate {value.op} on a CPU")
     return write

@@ -40,6 +40,7 @@ from onekernel.lower import (
     length_of,
     ordered,
     recomputable,
+    same_size,
 )
 
 STEP = "step"
@@ -282,9 +283,10 @@ class ProgramWriter:
         if x.dtype.kind == "f" and np.isnan(x):
             # The bits of an integer that is passed as a float may be those of a NaN. LLVM's text of
             # a NaN would not keep all of them: write the integer, and reinterpret it.
-            whole = self._writer.constant(int(x.view(np.int32)), self._on.type("i"))
-            return whole.bits_as(self._on.type("f"))
-        return self._writer.constant(x.item(), self._on.type(x.dtype.kind))
+            word = x.view(same_size("i", x.dtype))
+            whole = self._writer.constant(int(word), self._on.type(word.dtype))
+            return whole.bits_as(self._on.type(x.dtype))
+        return self._writer.constant(x.item(), self._on.type(x.dtype))
 
     def _any(self, condition: Value) -> Value:
         """Return whether a condition holds in any lane."""
@@ -343,7 +345,7 @@ class ProgramWriter:
         # Store what the iteration returns.
         for stack in item.stacks:
             value = self._operand(loop.stacked[stack.place])
-            self._store(self._addresses[stack.index], count, value)
+            self._store(stack, count, value)
         following = count + (-1 if loop.reverse else 1)
         updated = [following, *(self._operand(loop.updated[place]) for place in item.places)]
         for phi, start, new in zip(phis, initial, updated, strict=True):
@@ -360,7 +362,7 @@ class ProgramWriter:
         w, loop = self._writer, item.loop
         carries = [loop.carries[place] for place in item.places]
         initial = [self._operand(loop.initial[place]) for place in item.places]
-        initial.append(w.constant(True, self._on.type("b")) if self._mask is None else self._mask)
+        initial.append(w.constant(True, self._on.type(np.dtype(bool))) if self._mask is None else self._mask)
         head, body, end = w.labels("head", "body", "end")
         before = w.label
         w.jump(head)
@@ -430,7 +432,7 @@ class ProgramWriter:
         w = self._writer
         # Lanes that do not execute the enclosing block take no side.
         taking = condition if self._mask is None else condition & self._mask
-        absent = [Value(w, "zeroinitializer", self._on.type(x.dtype.kind)) for x in scalars]
+        absent = [Value(w, "zeroinitializer", self._on.type(x.dtype)) for x in scalars]
         if others is not None:
             absent = [x if isinstance(x, Value) else self._operand(x) for x in others]
         # Jump over the side if no lane takes it; behind it, both ways meet.
@@ -457,34 +459,43 @@ class ProgramWriter:
 
     def _allocated(self, array: Expr) -> Value:
         """Return the address of memory for the scalars of an array."""
-        w = self._writer
-        return w.allocate(length_of(array), self._on.type(array.dtype.kind), align=4 * w.lanes)
+        type, align = self._on.type(array.dtype), self._alignment(array.dtype)
+        return self._writer.allocate(length_of(array), type, align=align)
 
-    def _store(self, array: Value, place: Value | int, value: Value) -> None:
-        array.at(place, value.type).store(value, align=4 * self._writer.lanes)
+    def _alignment(self, dtype: np.dtype) -> int:
+        """Return the bytes to which numbers of all lanes are aligned in an array."""
+        return dtype.itemsize * self._writer.lanes
 
-    def _array(self, array: Expr) -> Value:
-        """Append an array of given scalars, and return its address."""
+    def _store(self, array: Expr, place: Value | int, value: Value) -> None:
+        address = self._addresses[array.index].at(place, value.type)
+        address.store(value, align=self._alignment(array.dtype))
+
+    def _array(self, array: Expr) -> None:
+        """Append an array of given scalars."""
         if is_table(array):
-            return self._table(array)
-        address = self._allocated(array)
+            self._addresses[array.index] = self._table(array)
+            return
+        self._addresses[array.index] = self._allocated(array)
         for i, x in enumerate(array.operands):
             self._writer.divide(i)
-            self._store(address, i, self._operand(x))
-        return address
+            self._store(array, i, self._operand(x))
 
     def _table(self, array: Expr) -> Value:
         """Return the address of an array of constants, of which the module has one for all lanes.
 
         Its words are written as integers, which keep the bits of a NaN.
         """
-        numbers = np.array([np.asarray(x) for x in array.operands]).view(np.int32)
-        name = f"@table_{hashlib.sha256(numbers.tobytes()).hexdigest()[:16]}"
-        words = ", ".join(f"i32 {number}" for number in numbers)
+        kind = same_size("i", array.dtype)
+        numbers = np.array([np.asarray(x) for x in array.operands]).view(kind)
+        element, size = ELEMENTS[kind], kind.itemsize
+        # The same bytes may be a table of 32 and of 64 bits.
+        content = numbers.tobytes() + (b"" if size == 4 else element.encode())
+        name = f"@table_{hashlib.sha256(content).hexdigest()[:16]}"
+        words = ", ".join(f"{element} {number}" for number in numbers)
         # On a GPU, it is in address space 1, as the arrays of XLA.
         space = " addrspace(1)" if self._on.for_gpu else ""
         self._writer.declare(
-            f"{name} = internal{space} constant [{len(numbers)} x i32] [{words}], align 4"
+            f"{name} = internal{space} constant [{len(numbers)} x {element}] [{words}], align {size}"
         )
         return Value(self._writer, name, f"ptr{space}")
 
@@ -494,14 +505,14 @@ class ProgramWriter:
         array, index = value.operands
         assert isinstance(array, Expr)
         address, is_one = self._addresses[array.index], is_table(array)
-        element, vectors = ELEMENTS[value.dtype.kind], self._on.type(value.dtype.kind)
+        element, vectors = ELEMENTS[value.dtype], self._on.type(value.dtype)
         # A constant or a counter is the same in all lanes: load the vector of all of them, or the
         # one number of a table.
         if is_constant(index) or index.op == "counter":
             place = int(index) if is_constant(index) else self._counters[index.index]
             if is_one:
                 return address.at(place, element).load(element).splat(w.lanes)
-            return address.at(place, vectors).load(vectors, align=4 * w.lanes)
+            return address.at(place, vectors).load(vectors, align=self._alignment(value.dtype))
         places = self._operand(index)
         if w.lanes == 1:
             return address.at(places, element).load(element)
@@ -519,7 +530,7 @@ class ProgramWriter:
 
     def _operation(self, value: Expr) -> None:
         if value.op == "array":
-            self._addresses[value.index] = self._array(value)
+            self._array(value)
             return
         if self._is_deferred(value):
             return
@@ -547,8 +558,11 @@ class ProgramWriter:
             # LLVM would find the equal operation before the loop, and take its value: pass an
             # operand through an instruction that LLVM does not know.
             operand = operands[place]
+            size, register = ("f32", "f") if operand.type == "float" else ("f64", "d")
             operands[place] = self._writer.let(
-                f'call float asm sideeffect "mov.f32 $0, $1;", "=f,f"({operand.typed})', "float"
+                f'call {operand.type} asm sideeffect "mov.{size} $0, $1;",'
+                f' "={register},{register}"({operand.typed})',
+                operand.type,
             )
             self._again[key] = write_of(value, for_gpu=True)(self._on, value, operands)
         return self._again[key]

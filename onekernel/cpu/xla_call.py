@@ -11,7 +11,6 @@ its size, and the function returns without a result if a size differs from the e
 """
 
 import contextlib
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
 
@@ -44,8 +43,8 @@ BLOCK_PARAMETERS = ("ptr job", "u64 index", "ptr scratch")
 def kernel_text(kernel: Kernel, *, lanes: int, machine: str) -> str:
     """Write the LLVM module whose function XLA calls.
 
-    The function takes and returns float32 arrays of shape (instances, ...). With a
-    table, it takes these arrays and the table, and returns the bytes of all instances, of shape
+    The function takes and returns arrays of shape (instances, ...), whose words it copies as
+    float32. With a table, it takes these arrays and the table, and returns the bytes of all instances, of shape
     (instances, items x results).
 
     Args:
@@ -164,8 +163,7 @@ def step_functions(kernel: Kernel, lanes: int) -> list[LlvmWriter]:
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction.
     """
-    sizes = [math.prod(shape) for shape in kernel.argument_shapes]
-    results = [math.prod(result.shape) for result in kernel.results()]
+    sizes, results = kernel.argument_words, kernel.result_words
     # The tile begins with the rows of the step's arguments, where it also leaves its results. If
     # there are parts before the first step and after the last, the kernel's own arguments follow.
     step_rows = range(sum(array.size for array in kernel.program.inputs))
@@ -195,8 +193,7 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
       start: the first row of the tile for the arguments; those of the results begin at 0.
       height: the number of rows of the tile.
     """
-    sizes = [math.prod(shape) for shape in kernel.argument_shapes]
-    results = [math.prod(result.shape) for result in kernel.results()]
+    sizes, results = kernel.argument_words, kernel.result_words
     names = [f"ptr a{i}" for i in range(len(sizes) + len(results))]
     w = LlvmWriter("instances", *names, "u64 first", "u64 instances", lanes=lanes)
     *arrays, first, instances = w.parameters
@@ -267,7 +264,7 @@ def _map_functions(kernel: Kernel, items: int, lanes: int) -> list[LlvmWriter]:
     job, index, _ = w.parameters
     # All instances share the table, which stands between the arguments and the results.
     # Bytes from one instance to the next in each array: float32 arguments, the table, the results.
-    rows = [*(4 * math.prod(shape) for shape in kernel.argument_shapes), 0]
+    rows = [*(4 * words for words in kernel.argument_words), 0]
     rows.append(items * len(kernel.program.outputs))
     arrays = [array_of(job, i) for i in range(len(rows))]
     w.call(STEP, *(array.at(index * size, "u8") for array, size in zip(arrays, rows, strict=True)))

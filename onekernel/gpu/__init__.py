@@ -123,8 +123,7 @@ def _shared_words(kernel: Kernel, architecture: int) -> int:
     if kernel.table is not None:
         return 0
     # Shared memory holds the arguments first, and the results later.
-    shapes = kernel.argument_shapes, [x.shape for x in kernel.results()]
-    words = max(sum(map(math.prod, one)) for one in shapes)
+    words = max(sum(kernel.argument_words), sum(kernel.result_words))
     # Even the smallest block must fit.
     fits = 4 * _MIN_THREADS * words <= _SHARED_BYTES[architecture]
     return words if words > _DIRECT_WORDS and fits else 0

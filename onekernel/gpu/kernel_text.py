@@ -1,6 +1,5 @@
 """Write kernels as LLVM IR for NVIDIA GPUs: a step, whose thread runs one instance, or a map."""
 
-import math
 from collections.abc import Iterator, Sequence
 
 from onekernel import codegen
@@ -26,7 +25,7 @@ def kernel_text(kernel: Kernel, *, shares: bool = False) -> str:
     """Write a kernel that steps as LLVM IR.
 
     Its parameters are the addresses of all argument leaves, followed by the addresses of all result
-    leaves. Each is a float32 array of shape (instances, ...).
+    leaves. Each is an array of shape (instances, ...), whose words are copied as float32.
 
     Args:
       kernel: the kernel.
@@ -35,8 +34,7 @@ def kernel_text(kernel: Kernel, *, shares: bool = False) -> str:
     Returns:
       The text of an LLVM module.
     """
-    sizes = [math.prod(shape) for shape in kernel.argument_shapes]
-    stored = [math.prod(result.shape) for result in kernel.results()]
+    sizes, stored = kernel.argument_words, kernel.result_words
     w = _writer(len(sizes) + len(stored))
     # Shared memory (address space 3) whose size the launch gives: an array of length 0.
     w.declare("@shared = external addrspace(3) global [0 x float], align 16")

@@ -20,10 +20,9 @@ from onekernel.lower.indexing import (
     shape_of,
 )
 from onekernel.lower.random_rules import select
-from onekernel.lower.scalar_ir import ExprGraph, Scalar
+from onekernel.lower.scalar_ir import DTYPES, ExprGraph, Scalar, bits_of, same_size
 
-_FLOAT, _INT = np.dtype(np.float32), np.dtype(np.int32)
-_WORDS = {_FLOAT, _INT, np.dtype(np.uint32), np.dtype(bool)}
+_WORD, _LONG = np.dtype(np.uint32), np.dtype(np.uint64)
 
 # Functions that other modules use, too.
 
@@ -64,6 +63,8 @@ def at(array: ScalarArray, i: int) -> ScalarArray:
 def bitcast(graph: ExprGraph, x: ScalarArray, source: np.dtype, to: np.dtype) -> ScalarArray:
     """Return the same bits as another dtype; a bool is 0 or 1.
 
+    A number of 64 bits is two of 32 bits along a last axis, the lower bits first.
+
     Args:
       graph: the graph.
       x: the scalars.
@@ -72,19 +73,27 @@ def bitcast(graph: ExprGraph, x: ScalarArray, source: np.dtype, to: np.dtype) ->
     """
     if source == to:
         return x
-    if not {source, to} <= _WORDS:
+    if not {source, to} <= {*DTYPES}:
         raise UnsupportedError(f"the bits of {source} as {to}")
+    if bits_of(source) > bits_of(to):
+        halves = [half for one in x.ravel() for half in graph.halves(_cast(graph, one, _LONG))]
+        return bitcast(graph, scalar_array(halves, (*x.shape, 2)), _WORD, to)
+    if bits_of(source) < bits_of(to):
+        words = bitcast(graph, x, source, _WORD).reshape(-1, 2)
+        joined = (_cast(graph, graph.joined(*pair), to) for pair in words)
+        return scalar_array(joined, x.shape[:-1])
+    return scalar_array((_cast(graph, one, to) for one in x.ravel()), x.shape)
 
-    def cast(one: Scalar) -> Scalar:
-        # Between a float32 and an integer, take the bits as they are. Between integers of 32
-        # bits, a conversion keeps them.
-        if {source.kind, to.kind} in ({"f", "i"}, {"f", "u"}):
-            # The graph's `bitcast` is between float32 and int32 only.
-            whole = one if source.kind == "f" else graph.convert(one, np.dtype(np.int32))
-            one = graph.apply("bitcast", whole)
-        return graph.convert(one, to)
 
-    return scalar_array(map(cast, x.ravel()), x.shape)
+def _cast(graph: ExprGraph, x: Scalar, to: np.dtype) -> Scalar:
+    """Return a scalar's bits as another dtype of their number; a bool is 0 or 1."""
+    # Between a float and an integer, take the bits as they are. Between integers of one size, a
+    # conversion keeps them.
+    if {x.dtype.kind, to.kind} in ({"f", "i"}, {"f", "u"}):
+        # The graph's `bitcast` is between floats and integers with a sign only.
+        whole = x if x.dtype.kind == "f" else graph.convert(x, same_size("i", x.dtype))
+        x = graph.apply("bitcast", whole)
+    return graph.convert(x, to)
 
 
 # The rules.
@@ -136,13 +145,18 @@ def _integer_pow(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> Scalar
 
 
 def _logistic(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
-    one = constant_array(np.float32(1))
+    one = _one(equation)
     exp = elementwise(graph, "exp", elementwise(graph, "neg", x))
     return elementwise(graph, "div", one, elementwise(graph, "add", one, exp))
 
 
 def _rsqrt(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
-    return elementwise(graph, "div", constant_array(np.float32(1)), elementwise(graph, "sqrt", x))
+    return elementwise(graph, "div", _one(equation), elementwise(graph, "sqrt", x))
+
+
+def _one(equation: JaxprEqn) -> ScalarArray:
+    """Return 1 in the dtype of an equation's result."""
+    return constant_array(np.ones((), dtype_of(equation.outvars[0])))
 
 
 def _reduce(

@@ -31,6 +31,7 @@ from onekernel.lower.scalar_ir import (
     ExprGraph,
     Loop,
     Scalar,
+    bits_of,
     check_scalars,
     is_constant,
     is_same,
@@ -224,8 +225,8 @@ class ControlFlow:
         changing = [
             k for k, x in enumerate(returned) if not is_constant(x) and x.index > counter.index
         ]
-        check_bytes(4 * length * len(changing))
-        words = (returned[k] for k in changing)
+        words = [returned[k] for k in changing]
+        check_bytes(length * sum(bits_of(x.dtype) // 8 for x in words))
         loop.stacked = [graph.convert(x, _INT) if x.dtype == bool else x for x in words]
         end = self._end_loop(loop, carry, carried)
         stacks = dict(zip(changing, graph.stacks(loop), strict=True))

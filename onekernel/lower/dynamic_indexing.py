@@ -58,7 +58,7 @@ def read_at(graph: ExprGraph, scalars: Sequence[Scalar], index: Scalar) -> Scala
     first, *others = scalars
     if all(is_same(first, x) for x in others):
         return first
-    # Memory holds words of 32 bits: a bool is 0 or 1.
+    # Memory holds words of 32 and 64 bits: a bool is 0 or 1.
     words = [graph.convert(x, _INT) if x.dtype == bool else x for x in scalars]
     return graph.convert(graph.load(graph.array(words), index), first.dtype)
 
@@ -405,8 +405,8 @@ def _rank(graph: ExprGraph, x: Scalar) -> Scalar:
         return x
     word = graph.apply("bitcast", x)
     # Of negative floats, the larger ones have the smaller bits beside the sign.
-    inverted = graph.apply("xor", word, np.int32(2**31 - 1))
-    return graph.select(graph.apply("lt", word, np.int32(0)), word, inverted)
+    inverted = graph.apply("xor", word, word.dtype.type(np.iinfo(word.dtype).max))
+    return graph.select(graph.apply("lt", word, word.dtype.type(0)), word, inverted)
 
 
 DYNAMIC_RULES: dict[str, Rule] = {

@@ -58,8 +58,9 @@ from onekernel.lower.scalar_ir import (
     EVALUATE,
     ExprGraph,
     Scalar,
+    bits_of,
+    bytes_of,
     is_constant,
-    length_of,
 )
 from onekernel.lower.schedule import Block, schedule
 from onekernel.lower.simplify import SIMPLE_POWERS, make_graph
@@ -108,7 +109,7 @@ class ScalarProgram:
     @property
     def array_bytes(self) -> int:
         """Return the bytes of memory that the arrays of one instance take."""
-        return sum(4 * length_of(array) for array in self.block.arrays())
+        return sum(map(bytes_of, self.block.arrays()))
 
 
 class LateProgram(ScalarProgram):
@@ -211,7 +212,8 @@ def scalarize_part(
         own arguments: what is computed before them is left out.
       results: the variables or literals that the program returns.
       words: whether the program takes and returns float32 only. A number of another dtype of 32
-        bits is then passed as a float32 with the same bits, and a bool as 0 or 1.
+        bits is then passed as a float32 with the same bits, a bool as 0 or 1, and a number of 64
+        bits as the two float32 of `bitcast`.
       finite: whether all numbers are finite, as for `ExprGraph`.
       approximate: as for `scalarize`.
 
@@ -238,7 +240,8 @@ def scalarize_part(
     for variable in arguments:
         dtype = np.dtype(dtype_of(variable))
         given = _FLOAT if words else dtype
-        inputs.append(full_array(shape_of(variable), lambda dtype=given: graph.input(dtype)))
+        shape = word_shape(shape_of(variable), dtype) if words else shape_of(variable)
+        inputs.append(full_array(shape, lambda dtype=given: graph.input(dtype)))
         env[variable] = bitcast(graph, inputs[-1], given, dtype)
     # Record the operations of all equations that the results need.
     outputs = lowering.lower_part(closed, env, results)
@@ -254,6 +257,11 @@ def scalarize_part(
         raise UnsupportedError(f"{program.size:,} operations, more than {MAX_PROGRAM_OPERATIONS:,}")
     check_bytes(program.array_bytes)
     return program
+
+
+def word_shape(shape: Sequence[int], dtype: np.dtype) -> tuple[int, ...]:
+    """Return the shape in which a program takes or returns an array as words."""
+    return (*shape, 2) if bits_of(dtype) == 64 else tuple(shape)
 
 
 def primitives() -> dict[str, list[str]]:

@@ -90,12 +90,15 @@ def _threefry2x32(
 def _seed(graph: ExprGraph, equation: JaxprEqn, seeds: ScalarArray) -> ScalarArray:
     if equation.params["impl"].name != "threefry2x32":
         raise UnsupportedError("random numbers other than those of Threefry")
-    # A key is a seed of 64 bits. Only a constant has so many, and the others are padded with zeros.
-    is_long = dtype_of(equation.invars[0]).itemsize == 8
-    firsts = (np.uint32((int(x) >> 32) % 2**32 if is_long else 0) for x in seeds.ravel())
-    return scalar_array(
-        map(Key, firsts, (graph.convert(x, _WORD) for x in seeds.ravel())), seeds.shape
-    )
+    # A key is a seed of 64 bits. Those of 32 are padded with zeros.
+    def first(seed: Scalar) -> Scalar:
+        if seed.dtype.itemsize < 8:
+            return np.uint32(0)
+        high = graph.apply("shift_right_logical", seed, seed.dtype.type(32))
+        return graph.convert(high, _WORD)
+
+    keys = (Key(first(x), graph.convert(x, _WORD)) for x in seeds.ravel())
+    return scalar_array(keys, seeds.shape)
 
 
 def _wrap(graph: ExprGraph, equation: JaxprEqn, words: ScalarArray) -> ScalarArray:
@@ -128,12 +131,17 @@ def _split(graph: ExprGraph, equation: JaxprEqn, keys: ScalarArray) -> ScalarArr
 
 
 def _bits(graph: ExprGraph, equation: JaxprEqn, keys: ScalarArray) -> ScalarArray:
-    if equation.params["bit_width"] != 32:
-        raise UnsupportedError("random bits other than words of 32")
+    width = equation.params["bit_width"]
+    if width not in (32, 64):
+        raise UnsupportedError(f"random bits other than words of 32 or 64: {width}")
     shape = equation.params["shape"]
     hashes = [one for key in keys.ravel() for one in _hashes(graph, key, shape)]
-    # A hash has two words; random bits of 32 are both of them combined.
-    bits = (graph.apply("xor", one.first, one.second) for one in hashes)
+    # A hash has two words; random bits of 32 are both of them combined, and 64 are one behind the
+    # other.
+    if width == 64:
+        bits = (graph.joined(one.second, one.first) for one in hashes)
+    else:
+        bits = (graph.apply("xor", one.first, one.second) for one in hashes)
     return scalar_array(bits, shape_of(equation.outvars[0]))
 
 

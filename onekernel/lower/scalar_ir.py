@@ -20,6 +20,7 @@ The rules that simplify or replace operations are in `simplify`, which passes th
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Union, cast
 
@@ -48,7 +49,7 @@ class Expr:
     iteration, and `load` is a scalar of an array."""
     operands: tuple[Scalar, ...]
     dtype: np.dtype
-    """dtype of the result, or of the scalars of an array: float32, int32, uint32 or bool."""
+    """dtype of the result, or of the scalars of an array, one of `DTYPES`."""
     index: int
     """Position in the order of recording; operands have smaller indices."""
     owner: "Loop | Branch | None" = None
@@ -119,36 +120,83 @@ _OF_TRUTHS = {
 """What arithmetic and order are between truth values: the operation of logic that takes their
 place, and whether it inverts its first and its second operand. False is below True."""
 
-_FLOAT, _INT, _BOOL = np.dtype(np.float32), np.dtype(np.int32), np.dtype(bool)
-_UINT = np.dtype(np.uint32)
-_DTYPES = (_FLOAT, _INT, _UINT, _BOOL)
+_INT, _BOOL = np.dtype(np.int32), np.dtype(bool)
+_WORD, _LONG = np.dtype(np.uint32), np.dtype(np.uint64)
+
+DTYPES = tuple(
+    map(np.dtype, ("bool", "float32", "int32", "uint32", "float64", "int64", "uint64"))
+)
+"""All dtypes that scalars have; arrays have all but the first."""
+
+
+_ROUNDING = ({"f", "i"}, {"f", "u"})
+"""Kinds of a float32 and an integer of 64 bits, of which the latter is no exact copy."""
+
+
+def bits_of(dtype: np.dtype) -> int:
+    """Return the number of bits of a number in memory: a bool is there an int32."""
+    return 32 if dtype == _BOOL else 8 * dtype.itemsize
+
+
+def same_size(kind: str, dtype: np.dtype) -> np.dtype:
+    """Return the dtype of a kind, such as `i`, whose numbers have as many bits as another one."""
+    return np.dtype(f"{kind}{bits_of(dtype) // 8}")
 
 
 def _divide(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     if a.dtype.kind == "f":
         return np.divide(a, b)
     # By 0, JAX returns the number whose bits are all set.
-    quotient = np.where(b == 0, -1, np.trunc(np.divide(a, np.where(b == 0, 1, b))))
-    return quotient.astype(np.int64).astype(a.dtype)
+    divisor = np.where(b == 0, b.dtype.type(1), b)
+    quotient = np.floor_divide(a, divisor)
+    # NumPy rounds down, JAX towards 0.
+    is_lower = (np.remainder(a, divisor) != 0) & ((a < 0) != (divisor < 0))
+    return np.where(b == 0, ~a.dtype.type(0), quotient + is_lower.astype(a.dtype))
 
 
 def _rest(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     if a.dtype.kind == "f":
         return np.fmod(a, b)
-    return np.where(b == 0, a, np.fmod(a, np.where(b == 0, 1, b))).astype(a.dtype)
+    return np.where(b == 0, a, np.fmod(a, np.where(b == 0, b.dtype.type(1), b)))
 
 
 def convert_constant(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
     """Convert to another dtype; integers saturate at their limits, and NaN becomes 0."""
     if x.dtype.kind == "f" and np.dtype(dtype).kind in "iu":
         ends = np.iinfo(dtype)
-        finite = np.nan_to_num(x.astype(np.float64), posinf=np.inf, neginf=-np.inf)
-        return np.clip(finite, ends.min, ends.max).astype(dtype)
+        wide = np.nan_to_num(x.astype(np.float64), posinf=np.inf, neginf=-np.inf)
+        # The largest integers of 64 bits are no float64: the next power of 2 is.
+        is_above, is_below = wide >= float(ends.max), wide <= float(ends.min)
+        inside = np.where(is_above | is_below, 0.0, wide).astype(dtype)
+        return np.where(is_above, dtype.type(ends.max), np.where(is_below, dtype.type(ends.min), inside))
     return x.astype(dtype)
 
 
 def _bitcast(x: np.ndarray) -> np.ndarray:
-    return x.view(_INT if x.dtype == _FLOAT else _FLOAT)
+    return x.view(same_size("i" if x.dtype.kind == "f" else "f", x.dtype))
+
+
+def _fused(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Return a · b + c, rounded as if it had been computed with twice the digits.
+
+    Source: T. J. Dekker, A floating-point technique for extending the available precision, 1971.
+    """
+    if a.dtype == np.float32:
+        return (np.float64(a) * np.float64(b) + np.float64(c)).astype(np.float32)
+
+    def halves(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        scaled = x * float(2**27 + 1)
+        high = scaled - (scaled - x)
+        return high, x - high
+
+    (a1, a2), (b1, b2) = halves(a), halves(b)
+    product = a * b
+    error = a2 * b2 - (((product - a1 * b1) - a2 * b1) - a1 * b2)
+    total = product + c
+    added = total - product
+    rest = (product - (total - added)) + (c - added) + error
+    # The halves of the largest numbers overflow.
+    return total + np.where(np.isfinite(rest), rest, 0.0)
 
 
 def _reduced(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,6 +206,11 @@ def _reduced(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     angle = np.arctan2(np.sin(wide), np.cos(wide))
     turns = np.round(angle * (2 / np.pi))
     return np.mod(turns, 4).astype(x.dtype), (angle - turns * (np.pi / 2)).astype(x.dtype)
+
+
+def _shift_right_logical(x: np.ndarray, by: np.ndarray) -> np.ndarray:
+    unsigned = same_size("u", x.dtype)
+    return (x.view(unsigned) >> by.view(unsigned)).view(x.dtype)
 
 
 def _erf_inv(x: np.ndarray) -> np.ndarray:
@@ -181,6 +234,7 @@ EVALUATE: dict[str, Callable[..., np.ndarray]] = {
     "exp": np.exp,
     "expm1": np.expm1,
     "floor": np.floor,
+    "fma": _fused,
     "ge": np.greater_equal,
     "gt": np.greater,
     "is_finite": np.isfinite,
@@ -199,10 +253,10 @@ EVALUATE: dict[str, Callable[..., np.ndarray]] = {
     "quarter_turns": lambda x: _reduced(x)[0],
     "reciprocal": np.reciprocal,
     "rem": _rest,
-    "rotate_left": lambda x, by: (x << by) | (x >> (x.dtype.type(32) - by)),
+    "rotate_left": lambda x, by: (x << by) | (x >> (x.dtype.type(bits_of(x.dtype)) - by)),
     "round": np.round,
     "shift_left": np.left_shift,
-    "shift_right_logical": lambda x, by: (x.view(np.uint32) >> by.view(np.uint32)).view(x.dtype),
+    "shift_right_logical": _shift_right_logical,
     "sign": np.sign,
     "sin": np.sin,
     "sqrt": np.sqrt,
@@ -211,7 +265,7 @@ EVALUATE: dict[str, Callable[..., np.ndarray]] = {
     "xor": np.bitwise_xor,
 }
 """The NumPy function of every operation except `select` and `convert`. `bitcast` takes the bits of
-a float32 for an int32, or the other way round; `round` rounds to the nearest whole number, and half
+a float for an integer with a sign, or the other way round; `fma` is a · b + c, rounded once; `round` rounds to the nearest whole number, and half
 of one to the nearest even. For an angle up to 2⁵⁰, `quarter_turns` is the nearest number of quarter
 turns, modulo 4, and `angle_rest` the angle that is left, between -π/4 and π/4."""
 
@@ -240,12 +294,13 @@ class ExprGraph:
         self.finite = finite
         self._simplifications = simplifications
         self._values: dict[tuple[Hashable, ...], Expr] = {}
+        self._made: dict[tuple[str, int], list[Scalar]] = {}
         self.count = 0
         """Number of recorded operations."""
 
     def is_exact(self, dtype: np.dtype) -> bool:
         """Return whether a rule for finite numbers, such as 0·x = 0, holds for a dtype here."""
-        return self.finite or dtype != _FLOAT
+        return self.finite or dtype.kind != "f"
 
     def input(self, dtype: np.dtype) -> Expr:
         """Add an input of the program."""
@@ -274,7 +329,7 @@ class ExprGraph:
         operand_dtype = recorded[0].dtype
         # All operands have one dtype: jaxprs convert numbers explicitly, and the generated code
         # cannot.
-        if operand_dtype not in _DTYPES or any(x.dtype != operand_dtype for x in operands):
+        if operand_dtype not in DTYPES or any(x.dtype != operand_dtype for x in operands):
             raise UnsupportedError(f"{op} of {', '.join(str(x.dtype) for x in operands)}")
         if operand_dtype == _BOOL and op in _OF_TRUTHS:
             logic, is_first_inverted, is_second_inverted = _OF_TRUTHS[op]
@@ -291,7 +346,7 @@ class ExprGraph:
         # Only comparisons and changes of bits have another dtype than their operands.
         dtype = _BOOL if op in COMPARISONS or op == "is_finite" else operand_dtype
         if op == "bitcast":
-            dtype = _INT if dtype == _FLOAT else _FLOAT
+            dtype = same_size("i" if dtype.kind == "f" else "f", dtype)
         return self._record(op, operands, dtype)
 
     def select(self, condition: Scalar, on_false: Scalar, on_true: Scalar) -> Scalar:
@@ -317,28 +372,44 @@ class ExprGraph:
         """Convert a scalar to another dtype."""
         if is_constant(x):
             return cast(Constant, convert_constant(np.asarray(x), dtype)[()])
-        # JAX has no 64-bit types by default, so no other dtypes occur.
-        if dtype not in _DTYPES:
+        if dtype not in DTYPES:
             raise UnsupportedError(f"a conversion to {dtype}")
         if x.dtype == dtype:
             return x
-        # A conversion between int32 and uint32 keeps the bits: there and back, nothing changes.
-        if x.op == "convert" and {x.dtype, dtype} == {_INT, _UINT}:
-            before = x.operands[0]
-            if before.dtype == dtype:
-                return before
+        # A conversion between integers of one size keeps the bits: there and back, nothing changes.
+        # So does a number of 32 bits that 64 bits hold without rounding.
+        if x.op == "convert" and x.operands[0].dtype == dtype:
+            kinds, rest = {x.dtype.kind, dtype.kind}, x.dtype.itemsize - dtype.itemsize
+            if (not rest and kinds == {"i", "u"}) or (rest == 4 and kinds not in _ROUNDING):
+                return x.operands[0]
         if dtype == _BOOL:
             return self.apply("ne", x, x.dtype.type(0))
         return self._record("convert", (x,), dtype)
+
+    def halves(self, x: Scalar) -> tuple[Scalar, Scalar]:
+        """Return the lower and the higher 32 bits of a uint64, as uint32."""
+        high = self.apply("shift_right_logical", x, np.uint64(32))
+        return self.convert(x, _WORD), self.convert(high, _WORD)
+
+    def joined(self, low: Scalar, high: Scalar) -> Scalar:
+        """Return the uint64 of its lower and its higher 32 bits, uint32."""
+        shifted = self.apply("shift_left", self.convert(high, _LONG), np.uint64(32))
+        return self.apply("or", shifted, self.convert(low, _LONG))
 
     def repeat(self, value: Expr, operands: Sequence[Scalar]) -> Expr:
         """Record an operation again with other operands, without simplifying it."""
         return self._record(value.op, tuple(operands), value.dtype)
 
+    def once(self, name: str, x: Expr, make: Callable[[], list[Scalar]]) -> list[Scalar]:
+        """Return what `make` records of one scalar under a name, and record it only once."""
+        if (name, x.index) not in self._made:
+            self._made[name, x.index] = make()
+        return self._made[name, x.index]
+
     def array(self, scalars: Sequence[Scalar]) -> Expr:
-        """Record an array of at least one scalar, all of one dtype, float32, int32 or uint32."""
+        """Record an array of at least one scalar, all of one dtype, which is not bool."""
         first = scalars[0]
-        if first.dtype not in (_FLOAT, _INT, _UINT) or any(x.dtype != first.dtype for x in scalars):
+        if first.dtype not in DTYPES[1:] or any(x.dtype != first.dtype for x in scalars):
             raise UnsupportedError(f"an array of {', '.join({str(x.dtype) for x in scalars})}")
         # What a loop has stacked is an array already.
         stack = first.operands[0] if isinstance(first, Expr) and first.op == "load" else None
@@ -368,8 +439,8 @@ class ExprGraph:
             if is_constant(index):
                 return array.operands[int(index)]
             # `jnp.arange` has its index everywhere.
-            if array.dtype == _INT and all(equals(x, i) for i, x in enumerate(array.operands)):
-                return index
+            if array.dtype.kind == "i" and all(map(equals, array.operands, itertools.count())):
+                return self.convert(index, array.dtype)
         return self._record("load", (array, index), array.dtype)
 
     def begin_loop(
@@ -449,6 +520,11 @@ def length_of(array: Expr) -> int:
         assert array.owner.length is not None
         return array.owner.length
     return len(array.operands)
+
+
+def bytes_of(array: Expr) -> int:
+    """Return the bytes of memory of an `array` or `stack`."""
+    return length_of(array) * bits_of(array.dtype) // 8
 
 
 def is_table(array: Expr) -> bool:

@@ -17,12 +17,13 @@ from onekernel.lower.scalar_ir import (
     ExprGraph,
     Scalar,
     Simplify,
+    bits_of,
     equals,
     is_constant,
+    same_size,
 )
 
-_FLOAT, _INT, _BOOL = np.dtype(np.float32), np.dtype(np.int32), np.dtype(bool)
-_UINT = np.dtype(np.uint32)
+_BOOL = np.dtype(bool)
 
 
 def make_graph(*, finite: bool = True, approximate: bool = False) -> ExprGraph:
@@ -52,7 +53,7 @@ def _simplify_commutative(
     if x is y and op in ("and", "or", "max", "min"):
         return x
     # NaN wins against every number, as in JAX.
-    if op in ("max", "min") and dtype == _FLOAT:
+    if op in ("max", "min") and dtype.kind == "f":
         for one in (x, y):
             if is_constant(one) and np.isnan(one):
                 return one
@@ -83,43 +84,43 @@ def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
 def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     # Integers whose divisor may be 0 or negative are divided by magnitudes, and the sign is set
     # afterwards.
-    if dtype != _FLOAT and not _is_positive(y):
+    if dtype.kind != "f" and not _is_positive(y):
         return _divided(graph, dtype, x, y)[0]
     if equals(x, 0) and graph.is_exact(dtype):
         return dtype.type(0)
     if equals(y, 1):
         return x
     # Multiply by the reciprocal instead, since a division takes several times as long.
-    if is_constant(y) and dtype == _FLOAT and y != 0:
-        return graph.apply("mul", x, np.float32(1 / np.float64(y)))
+    if is_constant(y) and dtype.kind == "f" and y != 0:
+        return graph.apply("mul", x, dtype.type(1 / np.float64(y)))
     return None
 
 
 def _simplify_rem(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if dtype == _FLOAT:
-        return _float_rest(graph, x, y)
+    if dtype.kind == "f":
+        return _float_rest(graph, dtype, x, y)
     return None if _is_positive(y) else _divided(graph, dtype, x, y)[1]
 
 
-def _float_rest(graph: ExprGraph, x: Scalar, y: Scalar) -> Scalar:
+def _float_rest(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar:
     """Return the remainder of x / y as C's fmod does, with the sign of x.
 
-    Its error is that of the product of the whole quotient and y.
+    It is exact where the quotient has fewer digits than the numbers.
     """
-    do, zero = graph.apply, np.float32(0)
+    do, zero, infinity = graph.apply, dtype.type(0), dtype.type(np.inf)
     size, rest = do("abs", y), do("abs", x)
     # A float32 quotient has 24 bits. If the whole quotient needs more, the first round leaves a
     # rest that is still larger than y, and the second round divides that.
     for _ in range(2):
         whole = do("floor", do("div", rest, size))
-        rest = do("sub", rest, do("mul", whole, size))
+        rest = elementary.subtract_product(graph, dtype, rest, whole, size)
         # The quotient may be rounded to the next whole number: bring the rest into 0 ... |y|.
         rest = graph.select(do("lt", rest, zero), rest, do("add", rest, size))
         rest = graph.select(do("ge", rest, size), rest, do("sub", rest, size))
     # If y is infinite, the remainder is x. If x is infinite or NaN, or y is 0 or NaN, it is NaN.
-    rest = graph.select(do("eq", size, np.float32(np.inf)), rest, do("abs", x))
-    is_number = do("and", do("lt", do("abs", x), np.float32(np.inf)), do("gt", size, zero))
-    rest = graph.select(is_number, np.float32(np.nan), rest)
+    rest = graph.select(do("eq", size, infinity), rest, do("abs", x))
+    is_number = do("and", do("lt", do("abs", x), infinity), do("gt", size, zero))
+    rest = graph.select(is_number, dtype.type(np.nan), rest)
     # The rest has the sign of the dividend.
     return graph.select(do("lt", x, zero), rest, do("neg", rest))
 
@@ -131,34 +132,33 @@ def _is_positive(y: Scalar) -> bool:
     """
     if is_constant(y):
         return bool(y > 0)
-    return y.op == "max" and y.dtype == _UINT and any(is_constant(x) and x > 0 for x in y.operands)
+    return y.op == "max" and y.dtype.kind == "u" and any(is_constant(x) and x > 0 for x in y.operands)
 
 
 def _divided(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
     """Return quotient and remainder of integers as JAX computes them, also of a division by 0.
 
-    The magnitudes are divided, as integers without a sign; -2³¹ has a magnitude, too, as uint32.
+    The magnitudes are divided, as integers without a sign, where -2³¹ has a magnitude, too.
     """
-    do, zero, one = graph.apply, dtype.type(0), np.uint32(1)
-    size_x, size_y = (graph.convert(_magnitude(graph, dtype, each), _UINT) for each in (x, y))
+    do, zero, unsigned = graph.apply, dtype.type(0), same_size("u", dtype)
+    size_x, size_y = (graph.convert(_magnitude(graph, dtype, each), unsigned) for each in (x, y))
     # Divide by 1 in place of 0, which would stop the program on x86, and replace the result below.
-    divisor = do("max", size_y, one)
+    divisor = do("max", size_y, unsigned.type(1))
     quotient = graph.convert(do("div", size_x, divisor), dtype)
     rest = graph.convert(do("rem", size_x, divisor), dtype)
     # The quotient is negative if the signs differ, and the remainder has the sign of the dividend.
-    if dtype == _INT:
+    if dtype.kind == "i":
         is_below = do("lt", x, zero)
         differ = do("xor", is_below, do("lt", y, zero))
         quotient = graph.select(differ, quotient, do("neg", quotient))
         rest = graph.select(is_below, rest, do("neg", rest))
     # JAX divides n by 0 to a quotient with all bits set and the remainder n.
     is_zero = do("eq", y, zero)
-    none = np.int32(-1) if dtype == _INT else np.uint32(2**32 - 1)
-    return graph.select(is_zero, quotient, none), graph.select(is_zero, rest, x)
+    return graph.select(is_zero, quotient, ~zero), graph.select(is_zero, rest, x)
 
 
 def _magnitude(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
-    return graph.apply("abs", x) if dtype == _INT else x
+    return graph.apply("abs", x) if dtype.kind == "i" else x
 
 
 def _simplify_shift(
@@ -166,18 +166,19 @@ def _simplify_shift(
 ) -> Scalar | None:
     """Expand a shift by an unknown number of bits into shifts by constants.
 
-    Processors differ in what they do for 32 bits and more, and LLVM leaves it undefined.
+    Processors differ in what they do for all bits and more, and LLVM leaves it undefined.
     """
-    do = graph.apply
-    # In JAX, the result of a shift by 32 bits or more is 0.
+    do, bits = graph.apply, bits_of(dtype)
+    # In JAX, the result of a shift by as many bits as there are, or more, is 0.
     if is_constant(by):
-        return None if 0 <= by < 32 else dtype.type(0)
-    # Shift by each bit of the number that is set; beyond 31, nothing is left.
-    for bit in range(5):
+        return None if 0 <= by < bits else dtype.type(0)
+    # Shift by each bit of the number that is set; beyond the last one, nothing is left.
+    for bit in range(bits.bit_length() - 1):
         is_set = do("ne", do("and", by, dtype.type(1 << bit)), dtype.type(0))
         x = graph.select(is_set, x, do(op, x, dtype.type(1 << bit)))
-    count = graph.convert(by, _UINT)
-    return graph.select(do("lt", count, np.uint32(32)), dtype.type(0), x)
+    unsigned = same_size("u", dtype)
+    count = graph.convert(by, unsigned)
+    return graph.select(do("lt", count, unsigned.type(bits)), dtype.type(0), x)
 
 
 def _simplify_inverse(op: str) -> Simplify:
@@ -256,7 +257,7 @@ def _approximate_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) ->
     """Divide by a product with the reciprocal, which all quotients of one divisor share."""
     # Some quotients need no reciprocal at all, such as those by a constant.
     simplified = _simplify_div(graph, dtype, x, y)
-    if simplified is not None or dtype != _FLOAT:
+    if simplified is not None or dtype.kind != "f":
         return simplified
     return graph.apply("mul", x, graph.apply("reciprocal", y))
 
@@ -268,7 +269,17 @@ def _approximate_tanh(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     return do("sub", do("mul", do("reciprocal", grown), np.float32(2)), np.float32(1))
 
 
-_APPROXIMATE: dict[str, Simplify] = {
+def _only_float32(op: str, approximate: Simplify) -> Simplify:
+    """Return what replaces an operation of float32, where those of float64 stay exact."""
+
+    def simplify(graph: ExprGraph, dtype: np.dtype, *operands: Scalar) -> Scalar | None:
+        chosen = _SIMPLIFY[op] if dtype == np.float64 else approximate
+        return chosen(graph, dtype, *operands)
+
+    return simplify
+
+
+_APPROXIMATIONS: dict[str, Simplify] = {
     # Instructions of their own.
     **dict.fromkeys(("exp", "log"), lambda graph, dtype, x: None),
     # Functions of these.
@@ -277,6 +288,7 @@ _APPROXIMATE: dict[str, Simplify] = {
     "log1p": lambda graph, dtype, x: graph.apply("log", graph.apply("add", x, np.float32(1))),
     "tanh": _approximate_tanh,
 }
+_APPROXIMATE = {op: _only_float32(op, how) for op, how in _APPROXIMATIONS.items()}
 """Functions that replace those of `_SIMPLIFY` in an approximate graph, whose `exp`, `log` and
 `reciprocal` are instructions of a GPU with a relative error of about 2⁻²². For x near 0, expm1,
-log1p and tanh have that as an absolute error, and so lose digits."""
+log1p and tanh have that as an absolute error, and so lose digits. Of float64, there are none."""
