@@ -22,7 +22,7 @@ _INSTANCES = 65
 _EVALUATIONS = 16
 """Number of evaluations with other round-off."""
 
-_ROUNDING = 1e-5
+_ROUNDING = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 2e-14}
 """Difference that is always allowed, as a part of the largest magnitude of a result's scalar."""
 
 _JUMP = 1e-3
@@ -79,12 +79,12 @@ def _draw(random: np.random.Generator, dtype: np.dtype, shape: tuple[int, ...]) 
     full = (_INSTANCES, *shape)
     if dtype.kind == "f":
         scale = np.exp(random.normal(size=(_INSTANCES, *[1] * len(shape))))
-        return (random.normal(size=full) * scale).astype(np.float32)
+        return (random.normal(size=full) * scale).astype(dtype)
     if dtype.kind == "b":
         return random.random(full) < 0.5
     if dtype.kind == "u":
-        return random.integers(0, 2**32, full, np.uint32)
-    return random.integers(0, 8, full, np.int32)
+        return random.integers(0, np.iinfo(dtype).max, full, dtype, endpoint=True)
+    return random.integers(0, 8, full, dtype)
 
 
 def _run(
@@ -125,7 +125,7 @@ def differ(
     with np.errstate(invalid="ignore", over="ignore"):
         spread = np.max([np.abs(x.astype(np.float64) - other) for x in shaken], axis=0)
         scale = np.maximum(np.abs(other), np.maximum(1e-3 * size, 1e-30))
-        allowed = _ROUNDING * scale + amplification * spread
+        allowed = _ROUNDING[one.dtype] * scale + amplification * spread
         close = np.abs(one.astype(np.float64) - other) <= allowed
     same = (one == other) | (np.isnan(one) & np.isnan(other))
     # A result that is finite in some evaluations only is as unsteady as one that varies.

@@ -24,8 +24,9 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 from onekernel.lower import call_of, scan_ends
 
-_NOISE = 2 * float(np.finfo(np.float32).eps)
-"""Largest relative change of a number: 2 to 4 units in the last place."""
+_NOISE = 2
+"""Largest relative change of a number, in units of the difference between 1 and the next number: it
+is 2 to 4 units in the last place."""
 
 _NOISY_TRIPS = 1000
 """Number of iterations of a while loop that have noise. A loop that runs until nothing changes may
@@ -103,15 +104,15 @@ class _Evaluation:
         return list(map(read, closed.jaxpr.outvars))
 
     def shaken(self, x: Array) -> Array:
-        """Return an array whose floats are changed by up to `_NOISE` of themselves."""
-        if x.dtype != jnp.float32:
+        """Return an array whose floats are changed by up to `_NOISE` units of themselves."""
+        if not is_float(x):
             return x
         self.count += 1
         return _shaken(x, self.seed, np.uint32(self.count * 0x9E3779B9 % 2**32))
 
     def rounded(self, operands: Sequence[Array], x: Array, other: Array) -> Array:
         """Return a result where it is exact, and elsewhere another one with noise."""
-        if x.dtype != jnp.float32:
+        if not is_float(x):
             return other
         return jnp.where(_is_exact(operands, x), x, self.shaken(other))
 
@@ -128,7 +129,7 @@ class _Evaluation:
             return found if equation.primitive.multiple_results else [found]
 
         plain = bind(operands)
-        if name in _EXACT or all(x.dtype != jnp.float32 for x in plain):
+        if name in _EXACT or not any(map(is_float, plain)):
             return plain
         other = bind(list(map(self.shaken, operands))) if name in _SUMS else plain
         if name in _SOLVERS:
@@ -180,26 +181,35 @@ class _Evaluation:
         return jax.lax.switch(operands[0].astype(jnp.int32), functions, *operands[1:])
 
 
+def is_float(x: Array) -> bool:
+    """Return whether numbers are float32 or float64."""
+    return x.dtype in (jnp.float32, jnp.float64)
+
+
 @jax.jit
 def _shaken(
     x: Float[Array, "..."], seed: UInt32[Array, ""], number: UInt32[Array, ""]
 ) -> Float[Array, "..."]:
     places = jnp.arange(x.size, dtype=jnp.uint32).reshape(x.shape)
     bits = jax.lax.bitcast_convert_type(x, jnp.uint32)
+    if x.dtype == jnp.float64:
+        bits = bits[..., 0] ^ bits[..., 1]
     bits ^= seed + number + places * np.uint32(0x85EBCA6B)
     # MurmurHash3 mixes the bits of a number so.
     bits = (bits ^ (bits >> 16)) * np.uint32(0x85EBCA6B)
     bits = (bits ^ (bits >> 13)) * np.uint32(0xC2B2AE35)
     bits = jax.lax.bitcast_convert_type(bits ^ (bits >> 16), jnp.int32)
-    size = jnp.where(seed == 0, np.float32(0), np.float32(_NOISE / 2**31))
-    return x * (1 + bits.astype(jnp.float32) * size)
+    unit = _NOISE * jnp.finfo(x.dtype).eps
+    size = jnp.where(seed == 0, x.dtype.type(0), x.dtype.type(unit / 2**31))
+    return x * (1 + bits.astype(x.dtype) * size)
 
 
 def _is_exact(operands: Sequence[Array], result: Array) -> Bool[Array, "..."]:
     """Return which numbers are whole and made of whole ones, so that nothing is rounded."""
-    exact = (result == jnp.round(result)) & (jnp.abs(result) < 2**24)
+    most = 2.0 ** (jnp.finfo(result.dtype).nmant + 1)
+    exact = (result == jnp.round(result)) & (jnp.abs(result) < most)
     for x in operands:
-        if x.dtype == jnp.float32:
+        if is_float(x):
             is_whole = x == jnp.round(x)
             exact &= is_whole if x.shape in ((), result.shape) else is_whole.all()
     return exact

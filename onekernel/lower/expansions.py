@@ -3,8 +3,8 @@
 A user could have written these functions in place of the operations: they are traced to jaxprs of
 operations that have lowering rules. So to add an operation, add a formula here.
 
-Subnormal float32 (below 1.2e-38) are taken for 0 by `exp` and `log`, and so by all functions that
-are made of them.
+Subnormal numbers (below 1.2e-38 in float32, 2.2e-308 in float64) are taken for 0 by `exp` and
+`log`, and so by all functions that are made of them.
 
 Source of formulas: M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions, chapter 4;
 H. S. Warren, Hacker's Delight, chapters 5 and 9. The polynomials are interpolated here.
@@ -13,6 +13,8 @@ H. S. Warren, Hacker's Delight, chapters 5 and 9. The polynomials are interpolat
 import functools
 import math
 from collections.abc import Callable, Sequence
+from decimal import Decimal
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +22,23 @@ import numpy as np
 from jaxtyping import Array
 
 from onekernel.errors import UnsupportedError
+from onekernel.lower import polynomials
+from onekernel.lower.extended import halves, log_power
+from onekernel.lower.scalar_ir import bits_of, same_size
 
 _LN2 = math.log(2.0)
 _BIG = 1e9
-"""Beyond this number, x² + 1 and x² are the same float32."""
+"""Beyond this number, x² + 1 and x² are the same float."""
+
+
+def _bits(x: Array, kind: str) -> Array:
+    """Return the bits of floats as integers of a kind, `i` or `u`."""
+    return jax.lax.bitcast_convert_type(x, same_size(kind, x.dtype))
+
+
+def _float(bits: Array, like: Array) -> Array:
+    """Return the floats that have some bits, of the dtype of others."""
+    return jax.lax.bitcast_convert_type(bits, like.dtype)
 
 
 # Functions of floats.
@@ -74,23 +89,34 @@ def _sinh(x: Array) -> Array:
     # beside eˣ, and eˣ / 2 is computed without overflow of eˣ.
     grown = jnp.expm1(jnp.minimum(size, 80.0))
     near = 0.5 * (grown + grown / (grown + 1.0))
-    return _with_sign(x, jnp.where(size < 80.0, near, jnp.exp(size - _LN2)))
+    return _with_sign(x, jnp.where(size < 80.0, near, _half_exp(size)))
 
 
 def _cosh(x: Array) -> Array:
-    # Half of each exponential, inside of the exponent: so the result overflows, and no term before
-    # it.
-    return jnp.exp(x - _LN2) + jnp.exp(-x - _LN2)
+    # The result overflows, and no term before it.
+    return _half_exp(x) + _half_exp(-x)
+
+
+def _half_exp(x: Array) -> Array:
+    """Return eˣ / 2, which overflows later than eˣ."""
+    if x.dtype == jnp.float32:
+        # The half is inside of the exponent.
+        return jnp.exp(x - _LN2)
+    # There it would cost the digits that x has before the point.
+    root = jnp.exp(0.5 * x)
+    return (0.5 * root) * root
 
 
 def _exp2(x: Array) -> Array:
     # 2ˣ = 2ⁿ exp((x - n) ln 2) with the nearest whole n, whose power is a float32 with the exponent
-    # n + 127.
-    whole = jnp.round(jnp.clip(x, -127.0, 128.0))
-    power = jax.lax.bitcast_convert_type((whole.astype(jnp.int32) + 127) << 23, jnp.float32)
+    # n + 127, or a float64 with n + 1023.
+    info = jnp.finfo(x.dtype)
+    bias = info.maxexp - 1
+    whole = jnp.round(jnp.clip(x, -float(bias), bias + 1.0))
+    power = _float((whole.astype(same_size("i", x.dtype)) + bias) << info.nmant, x)
     result = jnp.exp((x - whole) * _LN2) * power
     # Infinity times zero would be no number.
-    return jnp.where(x >= 128.0, jnp.inf, jnp.where(x < -126.0, 0.0, result))
+    return jnp.where(x >= bias + 1.0, jnp.inf, jnp.where(x < 1.0 - bias, 0.0, result))
 
 
 def _cbrt(x: Array) -> Array:
@@ -109,11 +135,11 @@ def _polynomial(x: Array, *coefficients: Array) -> Array:
 
 
 def power(x: Array, y: Array) -> Array:
-    """Compute x to the power of y, to 1e-5 of the result."""
-    y = y.astype(jnp.float32)
+    """Compute x to the power of y: of float32 to 1e-5 of the result, of float64 to some ulp."""
+    y = y.astype(x.dtype)
     size = jnp.abs(x)
     # xʸ = exp(y log|x|); then the sign and the special cases of C's pow.
-    result = jnp.exp(y * jnp.log(size))
+    result = log_power(size, y) if x.dtype == jnp.float64 else jnp.exp(y * jnp.log(size))
     # A negative number has powers with whole exponents only.
     is_whole, is_odd = jnp.floor(y) == y, jnp.floor(y * 0.5) * 2.0 != y
     is_below = jnp.signbit(x)
@@ -124,22 +150,36 @@ def power(x: Array, y: Array) -> Array:
 
 def _with_sign(x: Array, size: Array) -> Array:
     """Return `size`, which is not negative, with the sign of x; -0 has a sign, too."""
-    # The sign of a float32 is its highest bit.
-    word = functools.partial(jax.lax.bitcast_convert_type, new_dtype=jnp.uint32)
-    sign = word(x) & np.uint32(1 << 31)
-    return jax.lax.bitcast_convert_type(word(size) | sign, jnp.float32)
+    # The sign of a float is its highest bit.
+    word = _bits(x, "u")
+    sign = word & word.dtype.type(1 << (bits_of(x.dtype) - 1))
+    return _float(_bits(size, "u") | sign, x)
 
 
 _ERF_END = 0.8
 _ERFC_SCALE = 0.4
+_ERFC_LAST = {jnp.dtype(jnp.float32): 11.0, jnp.dtype(jnp.float64): 28.0}
+"""Beyond these numbers, erfc(x) is 0."""
 
 
-@functools.cache
-def _error_polynomials() -> tuple[list[float], list[float]]:
-    """Return the coefficients, highest first, of erf(x)/x in x² and of p(t) = log(erfc(x)/t) + x².
+class _ErrorPolynomials(NamedTuple):
+    """An `_ErrorPolynomials` has coefficients, highest first, for erf and erfc in one dtype.
 
     For large x, erfc(x) falls like exp(-x²)/x; so it is t exp(-x² + p(t)) with t = 1/(1 + c x).
     """
+
+    near: list[float]
+    """Those of erf(x)/x in x²."""
+    tail: list[float]
+    """Those of p(t) = log(erfc(x)/t) + x², in t less `centre`."""
+    centre: float
+
+
+@functools.cache
+def _error_polynomials(dtype: np.dtype) -> _ErrorPolynomials:
+    """Return the polynomials for float32 or float64."""
+    if dtype == np.float64:
+        return _precise_error_polynomials()
     # Imported late, because few programs need it.
     from scipy import special
 
@@ -154,19 +194,36 @@ def _error_polynomials() -> tuple[list[float], list[float]]:
         return np.log(special.erfcx(x) / t)
 
     near = fit(lambda s: special.erf(np.sqrt(s)) / np.sqrt(s), 7, 1e-12, _ERF_END**2)
-    return near, fit(tail, 11, 0.15, 1.0)
+    return _ErrorPolynomials(near, fit(tail, 11, 0.15, 1.0), 0.0)
+
+
+def _precise_error_polynomials() -> _ErrorPolynomials:
+    last = _ERFC_LAST[jnp.dtype(jnp.float64)]
+    low, high = (1.0 / (1.0 + _ERFC_SCALE * x) for x in (last, _ERF_END))
+    centre, half = (low + high) / 2.0, (high - low) / 2.0
+
+    def tail(u: Decimal) -> Decimal:
+        t = Decimal(centre) + u
+        x = (1 / t - 1) / Decimal(_ERFC_SCALE)
+        return (polynomials.erfc(x) / t).ln() + x * x
+
+    def fit(function: Callable[[Decimal], Decimal], degree: int, *ends: float) -> list[float]:
+        return [float(c) for c in reversed(polynomials.interpolate(function, degree, *ends))]
+
+    near = fit(polynomials.erf, 12, 0.0, _ERF_END**2)
+    return _ErrorPolynomials(near, fit(tail, 23, -half, half), centre)
 
 
 def _erf(x: Array) -> Array:
     # erf(x) is x times a polynomial near 0, and 1 - erfc(x) beyond.
-    near = x * _horner(_error_polynomials()[0], x * x)
+    near = x * _horner(_error_polynomials(x.dtype).near, x * x)
     far = _with_sign(x, 1.0 - _positive_erfc(jnp.abs(x)))
     return jnp.where(jnp.abs(x) < _ERF_END, near, far)
 
 
 def _erfc(x: Array) -> Array:
     # 1 - erf(x) loses no digits as long as erf(x) is not near 1.
-    near = 1.0 - x * _horner(_error_polynomials()[0], x * x)
+    near = 1.0 - x * _horner(_error_polynomials(x.dtype).near, x * x)
     far = _positive_erfc(jnp.abs(x))
     far = jnp.where(x < 0.0, 2.0 - far, far)
     return jnp.where(jnp.abs(x) < _ERF_END, near, far)
@@ -174,15 +231,15 @@ def _erfc(x: Array) -> Array:
 
 def _positive_erfc(x: Array) -> Array:
     """Return erfc(x) for x of at least `_ERF_END`; float32 has none beyond x = 10.1."""
-    x = jnp.minimum(x, 11.0)
+    _, tail, centre = _error_polynomials(x.dtype)
+    x = jnp.minimum(x, _ERFC_LAST[x.dtype])
     t = 1.0 / (1.0 + _ERFC_SCALE * x)
     # The relative error of exp(-x²) is the absolute error of x². So split x² = c² + (x - c)(x + c),
-    # where c is x with 12 bits, whose square is exact, and the rest is small.
-    coarse = jax.lax.bitcast_convert_type(
-        jax.lax.bitcast_convert_type(x, jnp.uint32) & np.uint32(0xFFFFF000), jnp.float32
-    )
+    # where c is x with half of its bits, whose square is exact, and the rest is small.
+    coarse, _ = halves(x)
     rest = (x - coarse) * (x + coarse)
-    return t * jnp.exp(-coarse * coarse) * jnp.exp(_horner(_error_polynomials()[1], t) - rest)
+    u = t - centre if centre else t
+    return t * jnp.exp(-coarse * coarse) * jnp.exp(_horner(tail, u) - rest)
 
 
 def _horner(coefficients: list[float], x: Array) -> Array:
@@ -206,8 +263,8 @@ def round_away_from_zero(x: Array) -> Array:
 
 def _shift_right_arithmetic(x: Array, by: Array) -> Array:
     if x.dtype.kind == "u":
-        whole = jax.lax.bitcast_convert_type(x, jnp.int32)
-        shifted = _shift_right_arithmetic(whole, by.astype(jnp.int32))
+        whole = _bits(x, "i")
+        shifted = _shift_right_arithmetic(whole, by.astype(whole.dtype))
         return jax.lax.bitcast_convert_type(shifted, x.dtype)
     # Of a negative number, shift the inverted bits: what is filled with zeros is inverted to ones.
     shift = jax.lax.shift_right_logical
@@ -215,19 +272,24 @@ def _shift_right_arithmetic(x: Array, by: Array) -> Array:
 
 
 def _population_count(x: Array) -> Array:
-    word = x.astype(jnp.uint32)
-    # Count the ones of each pair of bits, then of each 4, of each 8, and add up the four bytes.
-    word = word - ((word >> 1) & np.uint32(0x55555555))
-    word = (word & np.uint32(0x33333333)) + ((word >> 2) & np.uint32(0x33333333))
-    word = (word + (word >> 4)) & np.uint32(0x0F0F0F0F)
-    return ((word * np.uint32(0x01010101)) >> 24).astype(x.dtype)
+    word = x.astype(same_size("u", x.dtype) if x.dtype.itemsize == 8 else jnp.uint32)
+    ones = np.iinfo(word.dtype).max
+    # Every second bit, every second pair of them, every second group of four, and the first bit of
+    # every byte.
+    pairs, fours, eights, bytes = (word.dtype.type(ones // n) for n in (3, 5, 17, 255))
+    # Count the ones of each pair of bits, then of each 4, of each 8, and add up the bytes.
+    word = word - ((word >> 1) & pairs)
+    word = (word & fours) + ((word >> 2) & fours)
+    word = (word + (word >> 4)) & eights
+    return ((word * bytes) >> (bits_of(word.dtype) - 8)).astype(x.dtype)
 
 
 def _clz(x: Array) -> Array:
-    word = x.astype(jnp.uint32)
+    word = x.astype(same_size("u", x.dtype) if x.dtype.itemsize == 8 else jnp.uint32)
     # Fill all bits below the highest one, and count those that are left.
-    for by in (1, 2, 4, 8, 16):
-        word = word | (word >> by)
+    for by in (1, 2, 4, 8, 16, 32):
+        if by < bits_of(word.dtype):
+            word = word | (word >> by)
     return _population_count(~word).astype(x.dtype)
 
 
@@ -235,8 +297,8 @@ def _total_order(x: Array) -> Array:
     """Return integers in the order of floats by their bits: -NaN < -inf < ... < -0 < 0 < ..."""
     if x.dtype.kind != "f":
         return x
-    bits = jax.lax.bitcast_convert_type(x, jnp.int32)
-    return jnp.where(bits < 0, bits ^ np.int32(0x7FFFFFFF), bits)
+    bits = _bits(x, "i")
+    return jnp.where(bits < 0, bits ^ np.iinfo(bits.dtype).max, bits)
 
 
 def _lt_to(x: Array, y: Array) -> Array:
@@ -253,25 +315,25 @@ def _nextafter(x: Array, y: Array) -> Array:
     # -0 and 0 are one number: start from the one that lies on the side of y.
     order = jnp.where(x == 0.0, jnp.where(y > 0.0, 0, -1), order)
     order = jnp.where(y > x, order + 1, order - 1)
-    bits = jnp.where(order < 0, order ^ np.int32(0x7FFFFFFF), order)
-    moved = jax.lax.bitcast_convert_type(bits, jnp.float32)
+    bits = jnp.where(order < 0, order ^ np.iinfo(order.dtype).max, order)
+    moved = _float(bits, x)
     return jnp.where(jnp.isnan(x) | jnp.isnan(y), jnp.nan, jnp.where(x == y, y, moved))
 
 
 def _reduce_precision(x: Array, *, exponent_bits: int, mantissa_bits: int) -> Array:
     # Keep the exponent and drop the last bits of the fraction, as in bfloat16.
-    dropped = 23 - mantissa_bits
-    if exponent_bits >= 8 and dropped <= 0:
+    info = jnp.finfo(x.dtype)
+    dropped = info.nmant - mantissa_bits
+    if exponent_bits >= info.nexp and dropped <= 0:
         # With as many bits as it has, which is what `jax.checkpoint` asks of what it stores.
         return x
-    if exponent_bits == 8:
-        bits = jax.lax.bitcast_convert_type(x, jnp.uint32)
+    if exponent_bits == info.nexp:
+        bits = _bits(x, "u")
+        word, ones = bits.dtype.type, np.iinfo(bits.dtype).max
         # Round to the nearest, and half to the even.
         odd = (bits >> dropped) & 1
-        bits = (bits + odd + np.uint32((1 << (dropped - 1)) - 1)) & np.uint32(
-            0xFFFFFFFF & ~((1 << dropped) - 1)
-        )
-        return jnp.where(jnp.isnan(x), x, jax.lax.bitcast_convert_type(bits, jnp.float32))
+        bits = (bits + odd + word((1 << (dropped - 1)) - 1)) & word(ones & ~((1 << dropped) - 1))
+        return jnp.where(jnp.isnan(x), x, _float(bits, x))
     raise UnsupportedError(f"a rounding to {exponent_bits} and {mantissa_bits} bits")
 
 

@@ -228,7 +228,7 @@ def qr(
             is_done = square == 0
             vector = jnp.where(is_done, 0.0, rest / jnp.where(is_done, 1.0, first - wanted))
             factor = jnp.where(is_done, 0.0, (wanted - first) / jnp.where(is_done, 1.0, wanted))
-            vector = jnp.concatenate([jnp.zeros(k), jnp.ones(1), vector])
+            vector = jnp.concatenate([jnp.zeros(k, a.dtype), jnp.ones(1, a.dtype), vector])
             r = r - factor * jnp.outer(vector, vector @ r)
             reflections.append((factor, vector))
         # Q is the product of all reflections, applied from the last to the first.

@@ -115,7 +115,7 @@ class Control(Operations):
                 return (state[0] + step, *(now[t.name] for t in ends))
 
             limit = jnp.clip(known[trips.name], 0, most)
-            start = limit if counts_down else jnp.int32(0)
+            start = limit if counts_down else self.dtypes["i"](0)
             return lax.while_loop(goes_on, trip, (start, *(known[t.name] for t in first)))[1:]
 
         text = f"while {trips.name} and {going.name}: {[t.name for t in first]}"
@@ -148,7 +148,7 @@ class Control(Operations):
             return lax.while_loop(
                 lambda state: (state[0] < known[trips.name]) & (state[0] < 5),
                 trip,
-                (jnp.int32(0), first, prepared_of(first)),
+                (self.dtypes["i"](0), first, prepared_of(first)),
             )
 
         i = Term(0, (), "i", 5)
@@ -167,7 +167,7 @@ class Control(Operations):
         def do(known):
             def trip(count, state):
                 state = {t.name: x for t, x in zip(inside, state, strict=True)}
-                now = body.run(known | {i.name: count} | state)
+                now = body.run(known | {i.name: jnp.asarray(count, self.dtypes["i"])} | state)
                 return tuple(now[t.name] for t in ends)
 
             last = length if limit is None else jnp.clip(known[limit.name], 0, 6)

@@ -35,9 +35,9 @@ class RandomFunction(Control):
     their numbers, of size 0 where there is no such number, beside whole arrays and a key.
     """
 
-    def __init__(self, seed, size=8):
+    def __init__(self, seed, size=8, dtypes=DTYPES):
         arguments, self._structure = jax.tree.flatten(ARGUMENTS)
-        super().__init__(seed, arguments)
+        super().__init__(seed, arguments, dtypes)
         self._dropped = frozenset()
         self._controlled = set()
         self._add_lines(size)
@@ -59,8 +59,10 @@ class RandomFunction(Control):
         known |= {} if shake is None else {SHAKE: shake}
         known = self._block.run(known)
         return {
-            "exact": {kind: _numbers(known, chosen, kind) for kind, chosen in self._exact.items()},
-            "inexact": _numbers(known, self._inexact_ones, "f"),
+            "exact": {
+                kind: self._numbers(known, chosen, kind) for kind, chosen in self._exact.items()
+            },
+            "inexact": self._numbers(known, self._inexact_ones, "f"),
             "whole": tuple(known[t.name] for t in self._whole_ones),
             "keys": [known[t.name] for t in self._keys],
         }
@@ -96,7 +98,7 @@ class RandomFunction(Control):
         def nothing(known):
             like = likes.get(name)
             # Of no results, none can be looked up.
-            return {} if like is None else jnp.zeros(like.shape, DTYPES[like.kind])
+            return {} if like is None else jnp.zeros(like.shape, self.dtypes[like.kind])
 
         lines = [(n, text, nothing if n == name else do) for n, text, do in self._block.lines]
         smaller._block = Block(self._block.terms, lines)
@@ -111,6 +113,11 @@ class RandomFunction(Control):
             "whole": tuple(t.exact for t in self._whole_ones),
             "keys": [True] * len(self._keys),
         }
+
+    def _numbers(self, known, chosen, kind):
+        """Some numbers of terms, in one vector."""
+        numbers = [known[term.name].ravel()[i] for term, i in chosen]
+        return jnp.stack(numbers) if numbers else jnp.zeros(0, self.dtypes[kind])
 
     def _add_lines(self, count):
         for _ in range(count):
@@ -136,20 +143,15 @@ class RandomFunction(Control):
         return [*late, *self._random.choices(controlled, k=count - len(late))]
 
 
-def _numbers(known, chosen, kind):
-    """Some numbers of terms, in one vector."""
-    numbers = [known[term.name].ravel()[i] for term, i in chosen]
-    return jnp.stack(numbers) if numbers else jnp.zeros(0, DTYPES[kind])
-
-
-def inputs(seed, count):
+def inputs(seed, count, dtypes=DTYPES):
     """Arguments of so many instances."""
     rng = np.random.default_rng(seed)
-    most = int(LARGEST * 8)
+    dtypes = {kind: np.dtype(dtype).type for kind, dtype in dtypes.items()}
+    most, words = int(LARGEST * 8), np.iinfo(dtypes["u"]).max
     draw = {
-        "f": lambda shape: np.float32(rng.integers(-most, most + 1, shape)) / np.float32(8),
-        "i": lambda shape: rng.integers(-9, 10, shape).astype(np.int32),
-        "u": lambda shape: rng.integers(0, 2**32, shape, np.uint32),
+        "f": lambda shape: rng.integers(-most, most + 1, shape).astype(dtypes["f"]) / 8,
+        "i": lambda shape: rng.integers(-9, 10, shape).astype(dtypes["i"]),
+        "u": lambda shape: rng.integers(0, words, shape, dtypes["u"], endpoint=True),
         "b": lambda shape: rng.random(shape) < 0.5,
         "k": lambda shape: jax.random.split(jax.random.key(seed), shape),
     }

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from helpers.random_terms import BITS, BOUND, DTYPES, SHAPES, RandomLines, shaken
+from helpers.random_terms import BITS, BOUND, SHAPES, RandomLines, shaken
 
 
 class Operations(RandomLines):
@@ -148,7 +148,8 @@ class Operations(RandomLines):
         }
         if self._chance(0.2):
             name = self._draw(["float", "bool"])
-            dtype, kind = (jnp.float32, "f") if name == "float" else (jnp.bool_, "b")
+            kind = name[0]
+            dtype = self.dtypes[kind]
             self._emit(
                 f"{name}({x.name})",
                 lambda known: known[x.name].astype(dtype),
@@ -161,7 +162,7 @@ class Operations(RandomLines):
         do, bound = forms[name]
         self._emit(
             f"{name}({x.name}, {y.name})",
-            lambda known: do(known[x.name], known[y.name].astype(jnp.int32)),
+            lambda known: do(known[x.name], known[y.name].astype(self.dtypes["i"])),
             shape,
             "i",
             bound,
@@ -185,14 +186,14 @@ class Operations(RandomLines):
             "left": lambda p, q: p << (q & 31),
             "right": lambda p, q: p >> (q & 31),
             "far": lambda p, q: lax.shift_right_logical(p, jnp.broadcast_to(q & 63, p.shape)),
-            "with sign": lambda p, q: (p.view(jnp.int32) >> 3).view(jnp.uint32),
+            "with sign": lambda p, q: (p.view(self.signed) >> 3).view(p.dtype),
             "ones": lambda p, q: lax.population_count(p),
             "zeros": lambda p, q: lax.clz(p),
         }
         if self._chance(0.25):
             self._emit(
                 f"int({x.name} % 17)",
-                lambda known: (known[x.name] % 17).astype(jnp.int32),
+                lambda known: (known[x.name] % 17).astype(self.dtypes["i"]),
                 shape,
                 "i",
                 17,
@@ -421,9 +422,7 @@ class Operations(RandomLines):
         like, do = orders[name]
         self._emit(
             f"{name}({x.name}, {y.name})",
-            lambda known: do(known[x.name], known[y.name]).astype(
-                DTYPES[like.kind] if like else jnp.int32
-            ),
+            lambda known: do(known[x.name], known[y.name]),
             self._shape_of(do, x, y),
             like.kind if like else "i",
             like.bound if like else 6,

@@ -32,6 +32,16 @@ SHAKE = 0
 DTYPES = {"f": jnp.float32, "i": jnp.int32, "u": jnp.uint32, "b": jnp.bool_}
 """The dtypes of the kinds of terms; that of "k" is a random key's."""
 
+WIDE = {"f": jnp.float64, "i": jnp.int64, "u": jnp.uint64}
+"""Those of 64 bits."""
+
+
+def mixed_dtypes(seed):
+    """Dtypes of which some have 64 bits, for functions under `jax_enable_x64`."""
+    draw = random.Random(f"dtypes {seed}")
+    kinds = draw.sample([*WIDE], draw.randint(1, len(WIDE)))
+    return DTYPES | {kind: WIDE[kind] for kind in kinds}
+
 
 @dataclasses.dataclass(frozen=True)
 class Term:
@@ -68,14 +78,20 @@ class Block:
 class RandomLines:
     """Draws terms, and writes lines down; the kinds of lines are those of classes that follow."""
 
-    def __init__(self, seed, arguments):
+    def __init__(self, seed, arguments, dtypes=DTYPES):
         self._random = random.Random(seed)
+        self.dtypes = dtypes
         self._names = SHAKE
         self._depth = 0
         self._in_map = False
         self._text = []
         self._arguments = [dataclasses.replace(x, name=self._name()) for x in arguments]
         self._block = Block([*self._arguments])
+
+    @property
+    def signed(self):
+        """The dtype of integers with a sign that have as many bits as words."""
+        return np.dtype(f"i{np.dtype(self.dtypes['u']).itemsize}")
 
     def _name(self):
         self._names += 1
@@ -103,7 +119,13 @@ class RandomLines:
 
     def _line(self, text, do, shape, kind, bound, bits=0, exact=True):
         term = Term(self._name(), tuple(shape), kind, bound, bits, exact)
-        run = do if exact else lambda known: shaken(known | {term.name: do(known)}, term.name)
+
+        def run(known):
+            # Under `jax_enable_x64`, sums and places have 64 bits.
+            found = do(known)
+            found = found.astype(self.dtypes[kind]) if kind in self.dtypes else found
+            return found if exact else shaken(known | {term.name: found}, term.name)
+
         self._block.lines.append((term.name, text, run))
         self._block.terms.append(term)
         size = "" if exact else " inexact"
@@ -127,7 +149,7 @@ class RandomLines:
     def _clipped(self, term, most):
         return self._line(
             f"clip({term.name}, {-most}, {most})",
-            lambda known: jnp.clip(known[term.name], -most, most).astype(jnp.int32),
+            lambda known: jnp.clip(known[term.name], -most, most),
             term.shape,
             "i",
             most,
@@ -162,16 +184,16 @@ class RandomLines:
                 "b",
             )
         if kind == "u":
-            word = np.uint32(self._whole(0, 2**32 - 1))
+            word, signed = self.dtypes["u"](self._whole(0, 2**32 - 1)), self.signed
             return self._emit(
                 f"int({source.name}) ^ {word}",
-                lambda known: known[source.name].astype(jnp.int32).view(jnp.uint32) ^ word,
+                lambda known: known[source.name].astype(signed).view(word.dtype) ^ word,
                 source.shape,
                 "u",
             )
         return self._emit(
             f"int({source.name})",
-            lambda known: known[source.name].astype(jnp.int32),
+            lambda known: known[source.name].astype(self.dtypes["i"]),
             source.shape,
             "i",
             source.bound,
@@ -179,7 +201,7 @@ class RandomLines:
 
     def _constant(self):
         shape = self._draw(SHAPES)
-        values = np.float32([self._whole(-16, 16) / 8 for _ in range(math.prod(shape))])
+        values = np.dtype(self.dtypes["f"]).type([self._whole(-16, 16) / 8 for _ in range(math.prod(shape))])
         values = values.reshape(shape)
         return self._emit(f"{values.tolist()}", lambda known: jnp.asarray(values), shape, "f", 2, 3)
 
@@ -220,10 +242,11 @@ class RandomLines:
 
     def _shape_of(self, do, *terms):
         """The shape that JAX gives a function of some terms."""
-        operands = [jax.ShapeDtypeStruct(t.shape, DTYPES[t.kind]) for t in terms]
+        operands = [jax.ShapeDtypeStruct(t.shape, self.dtypes[t.kind]) for t in terms]
         return jax.eval_shape(do, *operands).shape
 
 
 def shaken(known, name):
     """Return a float, changed by its share of the shake if there is one."""
-    return known[name] * (1 + known[SHAKE][name]) if SHAKE in known else known[name]
+    x = known[name]
+    return x * (1 + known[SHAKE][name].astype(x.dtype)) if SHAKE in known else x

@@ -7,6 +7,7 @@ import pytest
 
 from helpers import call_frame, random_functions
 from helpers.further import slow_unless
+from helpers.random_terms import DTYPES, mixed_dtypes
 from helpers.run_program import evaluate
 from onekernel import cpu, fuse, gpu
 from onekernel.check import differ
@@ -30,7 +31,9 @@ AMPLIFICATION = 8.0
 """Multiple of what the shaking changes that a result may differ by."""
 
 SHAKES = 6
-SHAKE = 2 * float(np.finfo(np.float32).eps)
+SHAKE_UNITS = 2
+"""Largest change of a number that is shaken, in units of the last place of 1."""
+
 LANES = cpu.host_processor().lanes
 _engines = []
 
@@ -54,8 +57,9 @@ def by_xla(function, arguments, seed, *, batched):
         return jax.lax.map(lambda one: function(one, shake), x)
 
     run = compiled(jax.vmap(function, in_axes=(0, None)) if batched else one_by_one)
-    rng = np.random.default_rng(seed)
-    shakes = SHAKE * rng.uniform(-1, 1, (SHAKES, function.shakes)).astype(np.float32)
+    rng, dtype = np.random.default_rng(seed), np.dtype(function.dtypes["f"])
+    shakes = rng.uniform(-1, 1, (SHAKES, function.shakes)).astype(dtype)
+    shakes *= SHAKE_UNITS * np.finfo(dtype).eps
     plain, *shaken = (words(run(arguments, x)) for x in [np.zeros_like(shakes[0]), *shakes])
     return plain, shaken
 
@@ -106,7 +110,7 @@ def by_noise(kernel, arguments, like, seed):
 def by_stages(kernel, leaves, seed):
     """Yield the results of a kernel as NumPy, a vector register and a thread compute them."""
     program = kernel.program
-    passed = [x.astype(np.float32) if x.dtype == bool else x.view(np.float32) for x in leaves]
+    passed = [x.astype(np.float32) if x.dtype == bool else as_words(x) for x in leaves]
     yield "in NumPy", [np.asarray(x, np.float32) for x in evaluate(program, passed)]
     for lanes in (LANES, 1):
         text = xla_call.kernel_text(kernel, lanes=lanes, machine=cpu.host_processor().machine)
@@ -122,12 +126,19 @@ def received(results, like):
     """Return what a kernel returned, as arrays like others."""
     leaves, structure = jax.tree.flatten(like)
     pairs = zip(results, leaves, strict=True)
-    return structure.unflatten([x != 0 if y.dtype == bool else x.view(y.dtype) for x, y in pairs])
+    return structure.unflatten(
+        [x != 0 if y.dtype == bool else x.view(y.dtype).reshape(y.shape) for x, y in pairs]
+    )
+
+
+def as_words(x):
+    """Return numbers as a kernel reads them: float32, two along a last axis for one of 64 bits."""
+    return x.view(np.float32) if x.itemsize == 4 else x[..., None].view(np.float32)
 
 
 def compare(function, seed, monkeypatch, *, stages):
     """Check a random function, with the arguments of a seed."""
-    arguments = random_functions.inputs(seed, 2 * LANES + 3)
+    arguments = random_functions.inputs(seed, 2 * LANES + 3, function.dtypes)
     fused = fuse(function, on_unsupported="raise")
     with monkeypatch.context() as patch:
         if seed % 2:
@@ -152,8 +163,14 @@ def compare(function, seed, monkeypatch, *, stages):
         agree_all(function, results, theirs, shaken)
 
 
-def check(seed, monkeypatch, *, stages):
+def check(seed, monkeypatch, *, stages, is_wide=False):
     """Check the function of a seed; a failure tells as few of its lines as fail in this way.
+
+    Args:
+      seed: the seed.
+      monkeypatch: what the compiler's limits are changed with.
+      stages: whether each stage of the compiler is checked, too.
+      is_wide: whether some dtypes have 64 bits.
 
     Raises:
       AssertionError: a result is not XLA's, or a function cannot be compared.
@@ -161,12 +178,15 @@ def check(seed, monkeypatch, *, stages):
 
     def failure(function):
         try:
-            compare(function, seed, monkeypatch, stages=stages)
+            with jax.enable_x64(is_wide):
+                compare(function, seed, monkeypatch, stages=stages)
         except Exception as error:
             return error
         return None
 
-    function = random_functions.RandomFunction(seed)
+    dtypes = mixed_dtypes(seed) if is_wide else DTYPES
+    with jax.enable_x64(is_wide):
+        function = random_functions.RandomFunction(seed, dtypes=dtypes)
     if error := failure(function):
         for name in reversed(function.lines):
             smaller = function.without(name)
@@ -180,6 +200,18 @@ def check(seed, monkeypatch, *, stages):
 )
 def test_a_function_is_what_jax_makes_of_it(seed, monkeypatch):
     check(seed, monkeypatch, stages=seed % STAGES == 0)
+
+
+@pytest.mark.parametrize("seed", slow_unless(range(QUICK).__contains__, range(BATCH)))
+def test_a_function_of_numbers_of_64_bits_is_what_jax_makes_of_it(seed, monkeypatch):
+    check(seed, monkeypatch, stages=seed % STAGES == 0, is_wide=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("batch", range(BATCHES))
+def test_thousands_of_functions_of_64_bits_are_what_jax_makes_of_them(batch, monkeypatch):
+    for seed in range(BATCH * (batch + 1), BATCH * (batch + 2)):
+        check(seed, monkeypatch, stages=seed % STAGES == 0, is_wide=True)
 
 
 @pytest.mark.slow

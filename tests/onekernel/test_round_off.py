@@ -100,8 +100,18 @@ def test_each_number_has_noise_of_its_own():
     change = found.astype(float) / np.float32(0.7) - 1
     assert len(np.unique(found)) > 5
     # An argument is changed, and the product again.
-    assert 1 < np.abs(change).max() / round_off._NOISE < 2.5
-    assert abs(change.mean()) < 0.1 * round_off._NOISE
+    most = round_off._NOISE * np.finfo(np.float32).eps
+    assert 1 < np.abs(change).max() / most < 2.5
+    assert abs(change.mean()) < 0.1 * most
+
+
+def test_numbers_of_64_bits_have_noise_in_their_own_last_bits():
+    with jax.enable_x64(True):
+        (found,) = evaluate(lambda x: x * 1, 5, np.full(1000, 0.7))
+    assert found.dtype == np.float64
+    change = found / 0.7 - 1
+    assert 1 < np.abs(change).max() / (round_off._NOISE * np.finfo(float).eps) < 2.5
+    assert len(np.unique(found)) > 5
 
 
 def test_a_loop_that_waits_until_nothing_changes_ends():
