@@ -25,6 +25,7 @@ from onekernel.lower import (
     word_shape,
 )
 
+
 def kernel_of(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
     """Lower a traced function to a kernel.
 
@@ -88,7 +89,8 @@ def whole_kernel_of(traced: ClosedJaxpr, places: Sequence[int], *, is_late: bool
         return _lower_part(traced, arguments, results)
 
     shapes = [
-        [word_shape(x.shape, x.dtype) for x in passed_avals(atoms)] for atoms in (arguments, results)
+        [word_shape(x.shape, x.dtype) for x in passed_avals(atoms)]
+        for atoms in (arguments, results)
     ]
     return Kernel(
         LateProgram(lower, *shapes) if is_late else lower(),

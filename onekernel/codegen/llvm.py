@@ -362,7 +362,9 @@ class ProgramWriter:
         w, loop = self._writer, item.loop
         carries = [loop.carries[place] for place in item.places]
         initial = [self._operand(loop.initial[place]) for place in item.places]
-        initial.append(w.constant(True, self._on.type(np.dtype(bool))) if self._mask is None else self._mask)
+        initial.append(
+            w.constant(True, self._on.type(np.dtype(bool))) if self._mask is None else self._mask
+        )
         head, body, end = w.labels("head", "body", "end")
         before = w.label
         w.jump(head)
@@ -494,9 +496,8 @@ class ProgramWriter:
         words = ", ".join(f"{element} {number}" for number in numbers)
         # On a GPU, it is in address space 1, as the arrays of XLA.
         space = " addrspace(1)" if self._on.for_gpu else ""
-        self._writer.declare(
-            f"{name} = internal{space} constant [{len(numbers)} x {element}] [{words}], align {size}"
-        )
+        type = f"[{len(numbers)} x {element}]"
+        self._writer.declare(f"{name} = internal{space} constant {type} [{words}], align {size}")
         return Value(self._writer, name, f"ptr{space}")
 
     def _load(self, value: Expr) -> Value:

@@ -44,8 +44,8 @@ def kernel_text(kernel: Kernel, *, lanes: int, machine: str) -> str:
     """Write the LLVM module whose function XLA calls.
 
     The function takes and returns arrays of shape (instances, ...), whose words it copies as
-    float32. With a table, it takes these arrays and the table, and returns the bytes of all instances, of shape
-    (instances, items x results).
+    float32. With a table, it takes these arrays and the table, and returns the bytes of all
+    instances, of shape (instances, items x results).
 
     Args:
       kernel: the kernel.

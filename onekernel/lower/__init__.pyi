@@ -14,7 +14,6 @@ from .scalar_ir import DTYPES as DTYPES
 from .scalar_ir import Expr as Expr
 from .scalar_ir import Scalar as Scalar
 from .scalar_ir import bits_of as bits_of
-from .scalar_ir import bytes_of as bytes_of
 from .scalar_ir import is_constant as is_constant
 from .scalar_ir import is_table as is_table
 from .scalar_ir import length_of as length_of

@@ -29,6 +29,7 @@ from onekernel.lower.random_rules import Key, select
 from onekernel.lower.scalar_ir import (
     ExprGraph,
     Scalar,
+    bits_of,
     check_scalars,
     is_constant,
     is_same,
@@ -405,7 +406,7 @@ def _rank(graph: ExprGraph, x: Scalar) -> Scalar:
         return x
     word = graph.apply("bitcast", x)
     # Of negative floats, the larger ones have the smaller bits beside the sign.
-    inverted = graph.apply("xor", word, word.dtype.type(np.iinfo(word.dtype).max))
+    inverted = graph.apply("xor", word, word.dtype.type(2 ** (bits_of(x.dtype) - 1) - 1))
     return graph.select(graph.apply("lt", word, word.dtype.type(0)), word, inverted)
 
 

@@ -32,7 +32,7 @@ class _Format(NamedTuple):
     turn: tuple[float, ...]
     """π/2 as a sum of parts (Cody-Waite range reduction). All but the last have so few bits that
     their products with a number of turns are exact, so subtracting these loses no precision."""
-    ln2: tuple[float, float]
+    ln2: tuple[float, ...]
     """ln 2 as a sum of two parts. The product of the first with an exponent is exact."""
     exp: tuple[float, float]
     """From where to where exp is a normal number."""
@@ -80,9 +80,7 @@ def _horner(graph: ExprGraph, polynomial: Polynomial, x: Scalar) -> Scalar:
     return total
 
 
-def subtract_product(
-    graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar, z: Scalar
-) -> Scalar:
+def subtract_product(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar, z: Scalar) -> Scalar:
     """Return x - y · z, with a product that is not rounded where the processor can do so."""
     if dtype == _DOUBLE:
         return graph.apply("fma", graph.apply("neg", y), z, x)
@@ -172,7 +170,9 @@ def _far_angle(graph: ExprGraph, x: Scalar) -> tuple[Scalar, Scalar]:
     whole = do("or", do("and", bits, word(2**52 - 1)), word(2**52))
     exponent = graph.convert(do("shift_right_logical", bits, word(52)), np.dtype(np.int32))
     # Lanes whose angle is small have any exponent, but must not read beside the table.
-    place = do("min", do("max", do("add", exponent, np.int32(62 - 1075)), np.int32(0)), np.int32(1034))
+    place = do(
+        "min", do("max", do("add", exponent, np.int32(62 - 1075)), np.int32(0)), np.int32(1034)
+    )
     first = do("shift_right_logical", place, np.int32(5))
     scale = do("shift_left", word(1), graph.convert(do("and", place, np.int32(31)), np.dtype(word)))
     table = graph.array(_bits_of_turns())
@@ -194,7 +194,9 @@ def _far_angle(graph: ExprGraph, x: Scalar) -> tuple[Scalar, Scalar]:
     )
     # Two bits are whole quarter turns. What is left is between -½ and ½, by its sign.
     left = do("or", do("shift_left", top, word(2)), do("shift_right_logical", rest, word(62)))
-    rounded = do("add", do("shift_right_logical", top, word(62)), do("shift_right_logical", left, word(63)))
+    rounded = do(
+        "add", do("shift_right_logical", top, word(62)), do("shift_right_logical", left, word(63))
+    )
     turns = graph.convert(rounded, _DOUBLE)
     part = graph.convert(graph.convert(left, np.dtype(np.int64)), _DOUBLE)
     small = graph.convert(do("shift_left", rest, word(2)), _DOUBLE)

@@ -211,9 +211,8 @@ def scalarize_part(
       arguments: the variables whose values the program is given. They need not be the function's
         own arguments: what is computed before them is left out.
       results: the variables or literals that the program returns.
-      words: whether the program takes and returns float32 only. A number of another dtype of 32
-        bits is then passed as a float32 with the same bits, a bool as 0 or 1, and a number of 64
-        bits as the two float32 of `bitcast`.
+      words: whether the program takes and returns float32 only. Other numbers are then passed as
+        float32 with their bits, those of 64 bits as two (see `bitcast`), and a bool as 0 or 1.
       finite: whether all numbers are finite, as for `ExprGraph`.
       approximate: as for `scalarize`.
 
@@ -240,7 +239,7 @@ def scalarize_part(
     for variable in arguments:
         dtype = np.dtype(dtype_of(variable))
         given = _FLOAT if words else dtype
-        shape = word_shape(shape_of(variable), dtype) if words else shape_of(variable)
+        shape = word_shape(shape_of(variable), dtype, words)
         inputs.append(full_array(shape, lambda dtype=given: graph.input(dtype)))
         env[variable] = bitcast(graph, inputs[-1], given, dtype)
     # Record the operations of all equations that the results need.
@@ -259,9 +258,9 @@ def scalarize_part(
     return program
 
 
-def word_shape(shape: Sequence[int], dtype: np.dtype) -> tuple[int, ...]:
-    """Return the shape in which a program takes or returns an array as words."""
-    return (*shape, 2) if bits_of(dtype) == 64 else tuple(shape)
+def word_shape(shape: Sequence[int], dtype: np.dtype, words: bool = True) -> tuple[int, ...]:
+    """Return the shape in which a program takes or returns an array, mostly as words."""
+    return (*shape, 2) if words and bits_of(dtype) == 64 else tuple(shape)
 
 
 def primitives() -> dict[str, list[str]]:

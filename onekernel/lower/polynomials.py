@@ -62,7 +62,9 @@ def interpolate(
     """
     with decimal.localcontext(prec=DIGITS + 20):
         angles = (np.arange(degree + 1) + 0.5) * np.pi / (degree + 1)
-        points = [Decimal(x) for x in ((low + high) / 2 + (high - low) / 2 * np.cos(angles)).tolist()]
+        points = [
+            Decimal(x) for x in ((low + high) / 2 + (high - low) / 2 * np.cos(angles)).tolist()
+        ]
         # Newton's divided differences.
         parts = [function(x) for x in points]
         for k in range(1, degree + 1):
@@ -113,12 +115,12 @@ def cosine(s: Decimal) -> Decimal:
 
 
 def expm1(x: Decimal) -> Decimal:
-    """Return (exp(x) - 1) / x."""
+    """Return the quotient of exp(x) - 1 and x."""
     return _sum(_powers(x, 1, 1))
 
 
 def tanh(s: Decimal) -> Decimal:
-    """Return tanh(√s) / √s."""
+    """Return the quotient of the hyperbolic tangent of √s and √s."""
     return _sum(_powers(s, 1, 2)) / _sum(_powers(s, 0, 2))
 
 
@@ -166,13 +168,13 @@ def parts(x: Decimal, *bits: int) -> tuple[float, ...]:
 
 
 def erf(s: Decimal) -> Decimal:
-    """Return erf(√s) / √s."""
+    """Return the quotient of the error function of √s and √s."""
     series = _sum(x * (-1) ** k / (2 * k + 1) for k, x in enumerate(_powers(s, 0, 1)))
     return series * 2 / (2 * half_pi()).sqrt()
 
 
 def erfc(x: Decimal) -> Decimal:
-    """Return erfc(x) of a positive x."""
+    """Return 1 - erf(x) of a positive x."""
     with decimal.localcontext(prec=2 * DIGITS):
         if x < 6:
             return 1 - x * erf(x * x)
@@ -184,7 +186,7 @@ def erfc(x: Decimal) -> Decimal:
 
 
 def erfc_inv(y: Decimal, near: float) -> Decimal:
-    """Return x with erfc(x) = y, by Newton's method from a float near it."""
+    """Return the x of which erfc is y, by Newton's method from a float near it."""
     x = Decimal(near)
     for _ in range(2):
         x += (erfc(x) - y) * (half_pi() / 2).sqrt() * (x * x).exp()

@@ -16,7 +16,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from onekernel.errors import UnsupportedError
-from onekernel.lower.indexing import Rule, ScalarArray, dtype_of, scalar_array, shape_of
+from onekernel.lower.indexing import Rule, ScalarArray, scalar_array, shape_of
 from onekernel.lower.scalar_ir import ExprGraph, Scalar
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -90,6 +90,7 @@ def _threefry2x32(
 def _seed(graph: ExprGraph, equation: JaxprEqn, seeds: ScalarArray) -> ScalarArray:
     if equation.params["impl"].name != "threefry2x32":
         raise UnsupportedError("random numbers other than those of Threefry")
+
     # A key is a seed of 64 bits. Those of 32 are padded with zeros.
     def first(seed: Scalar) -> Scalar:
         if seed.dtype.itemsize < 8:

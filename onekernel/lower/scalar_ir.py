@@ -123,9 +123,7 @@ place, and whether it inverts its first and its second operand. False is below T
 _INT, _BOOL = np.dtype(np.int32), np.dtype(bool)
 _WORD, _LONG = np.dtype(np.uint32), np.dtype(np.uint64)
 
-DTYPES = tuple(
-    map(np.dtype, ("bool", "float32", "int32", "uint32", "float64", "int64", "uint64"))
-)
+DTYPES = tuple(map(np.dtype, ("bool", "float32", "int32", "uint32", "float64", "int64", "uint64")))
 """All dtypes that scalars have; arrays have all but the first."""
 
 
@@ -168,7 +166,11 @@ def convert_constant(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
         # The largest integers of 64 bits are no float64: the next power of 2 is.
         is_above, is_below = wide >= float(ends.max), wide <= float(ends.min)
         inside = np.where(is_above | is_below, 0.0, wide).astype(dtype)
-        return np.where(is_above, dtype.type(ends.max), np.where(is_below, dtype.type(ends.min), inside))
+        below = np.where(is_below, dtype.type(ends.min), inside)
+        return np.where(is_above, dtype.type(ends.max), below)
+    if x.dtype.itemsize > dtype.itemsize:
+        with np.errstate(over="ignore"):
+            return x.astype(dtype)
     return x.astype(dtype)
 
 
@@ -182,7 +184,8 @@ def _fused(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     Source: T. J. Dekker, A floating-point technique for extending the available precision, 1971.
     """
     if a.dtype == np.float32:
-        return (np.float64(a) * np.float64(b) + np.float64(c)).astype(np.float32)
+        wide = np.asarray(a, np.float64) * b.astype(np.float64) + c
+        return wide.astype(np.float32)
 
     def halves(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         scaled = x * float(2**27 + 1)
@@ -265,9 +268,10 @@ EVALUATE: dict[str, Callable[..., np.ndarray]] = {
     "xor": np.bitwise_xor,
 }
 """The NumPy function of every operation except `select` and `convert`. `bitcast` takes the bits of
-a float for an integer with a sign, or the other way round; `fma` is a · b + c, rounded once; `round` rounds to the nearest whole number, and half
-of one to the nearest even. For an angle up to 2⁵⁰, `quarter_turns` is the nearest number of quarter
-turns, modulo 4, and `angle_rest` the angle that is left, between -π/4 and π/4."""
+a float for an integer with a sign, or the other way round; `fma` is a · b + c, rounded once;
+`round` rounds to the nearest whole number, and half of one to the nearest even. For a float32 angle
+up to 2⁵⁰, `quarter_turns` is the nearest number of quarter turns, modulo 4, and `angle_rest` the
+angle that is left, between -π/4 and π/4."""
 
 MAX_OPERATIONS = 1_000_000
 """Largest number of recorded operations, including those that nothing depends on."""

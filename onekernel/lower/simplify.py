@@ -132,7 +132,9 @@ def _is_positive(y: Scalar) -> bool:
     """
     if is_constant(y):
         return bool(y > 0)
-    return y.op == "max" and y.dtype.kind == "u" and any(is_constant(x) and x > 0 for x in y.operands)
+    return (
+        y.op == "max" and y.dtype.kind == "u" and any(is_constant(x) and x > 0 for x in y.operands)
+    )
 
 
 def _divided(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:

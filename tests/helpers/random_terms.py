@@ -201,7 +201,9 @@ class RandomLines:
 
     def _constant(self):
         shape = self._draw(SHAPES)
-        values = np.dtype(self.dtypes["f"]).type([self._whole(-16, 16) / 8 for _ in range(math.prod(shape))])
+        values = np.dtype(self.dtypes["f"]).type(
+            [self._whole(-16, 16) / 8 for _ in range(math.prod(shape))]
+        )
         values = values.reshape(shape)
         return self._emit(f"{values.tolist()}", lambda known: jnp.asarray(values), shape, "f", 2, 3)
 

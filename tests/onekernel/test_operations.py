@@ -15,7 +15,23 @@ pytestmark = pytest.mark.skipif(default_backend() is None, reason="no back end f
 
 COUNT = 48
 ODD = [0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 1e-3, 88.0, -88.0, 1e10, -1e30, np.inf, -np.inf, np.nan]
-ENDS = [0, 1, -1, 2**31 - 1, -(2**31), 7, -7]
+
+
+@pytest.fixture(params=[32, 64])
+def bits(request):
+    """Of how many bits numbers are; those of 64 need JAX's setting."""
+    with jax.enable_x64(request.param == 64):
+        yield request.param
+
+
+def widened(arrays, bits):
+    """Return arrays of numbers of so many bits."""
+    return [x.astype(f"{x.dtype.kind}{bits // 8}") for x in arrays]
+
+
+def unsigned(x):
+    """Return the bits of whole numbers as numbers without a sign."""
+    return x.view(f"u{x.dtype.itemsize}")
 
 
 def floats(*shape, seed=0, odd=False):
@@ -79,7 +95,7 @@ UNARY = {
     "erfc": special.erfc,
     "log_ndtr": lambda x: special.log_ndtr(jnp.maximum(x, -4.0)),
     "away from zero": lambda x: jax.lax.round(x, jax.lax.RoundingMethod.AWAY_FROM_ZERO),
-    "fewer bits": lambda x: jax.lax.reduce_precision(x, 8, 7),
+    "fewer bits": lambda x: jax.lax.reduce_precision(x, jnp.finfo(x.dtype).nexp, 7),
     "frexp": lambda x: jnp.frexp(jnp.where(jnp.isfinite(x), x, 3.0)),
     "silu": jax.nn.silu,
     "softplus": jax.nn.softplus,
@@ -104,8 +120,8 @@ WHOLE = {
     "zeros": lambda x, y: jax.lax.clz(x),
     "left": lambda x, y: jax.lax.shift_left(x, y),
     "right": lambda x, y: jax.lax.shift_right_logical(x, y),
-    "with sign": lambda x, y: jax.lax.shift_right_arithmetic(x, jnp.int32(3)),
-    "of words": lambda x, y: x.view(jnp.uint32) // jnp.maximum(y, 0).view(jnp.uint32),
+    "with sign": lambda x, y: jax.lax.shift_right_arithmetic(x, x.dtype.type(3)),
+    "of words": lambda x, y: unsigned(x) // unsigned(jnp.maximum(y, 0)),
 }
 
 ROWS = {
@@ -142,8 +158,8 @@ if jax.default_backend() == "cpu":
 
 WHOLE_ROWS = {
     **named("max", "min", "argmax", "argmin", "sort", "cumsum", "prod"),
-    "largest of words": lambda x: jnp.max(x.view(jnp.uint32)),
-    "smallest of words": lambda x: jnp.min(x.view(jnp.uint32)),
+    "largest of words": lambda x: jnp.max(unsigned(x)),
+    "smallest of words": lambda x: jnp.min(unsigned(x)),
     "largest of truths": lambda x: jnp.max(x > 0),
     "smallest of truths": lambda x: jax.lax.reduce_min(x > 0, (0,)),
     "larger truths": lambda x: (jnp.maximum(x > 0, x > 5), jnp.minimum(x > 0, x > 5)),
@@ -180,7 +196,7 @@ INDEXED = {
     "computed several times": lambda x, i: x.at[jnp.stack([i, 1, i])].apply(lambda y: 2 * y + 1),
     "replaced": lambda x, i: jax.lax.dynamic_update_slice(x, x[:2], (i,)),
     "rolled": lambda x, i: jnp.roll(x, i),
-    "found": lambda x, i: jnp.searchsorted(jnp.cumsum(jnp.abs(x)), i.astype(jnp.float32)),
+    "found": lambda x, i: jnp.searchsorted(jnp.cumsum(jnp.abs(x)), i.astype(x.dtype)),
     "between": lambda x, i: jnp.interp(i * 0.3, jnp.cumsum(jnp.abs(x)), x),
     "counted": lambda x, i: jnp.bincount(jnp.stack([i, i, i + 1]), length=5),
     "set in a loop": lambda x, i: jax.lax.fori_loop(
@@ -250,33 +266,46 @@ def both(functions, arguments):
     return found, jax.jit(jax.vmap(together))(*arguments)
 
 
-def assert_close(found, expected, relative=2e-5, absolute=2e-6):
+TOLERANCES = {"float32": (2e-5, 2e-6), "float64": (3e-14, 1e-15)}
+"""Relative and absolute."""
+
+
+def assert_close(found, expected):
     for name, want in expected.items():
         for one, other in zip(jax.tree.leaves(found[name]), jax.tree.leaves(want), strict=True):
             assert one.dtype == other.dtype, name
             if other.dtype.kind == "f":
-                np.testing.assert_allclose(one, other, relative, absolute, err_msg=name)
+                tolerances = TOLERANCES[other.dtype.name]
+                np.testing.assert_allclose(one, other, *tolerances, err_msg=name)
             else:
                 np.testing.assert_array_equal(one, other, err_msg=name)
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_functions_of_floats(group):
-    found, expected = both(*GROUPS[group])
+def test_functions_of_floats(group, bits):
+    functions, arguments = GROUPS[group]
+    if bits == 64:
+        # As by cuDNN.
+        functions = {name: f for name, f in functions.items() if name != "filtered"}
+    found, expected = both(functions, widened(arguments, bits))
     assert_close(found, expected)
 
 
-def test_functions_of_whole_numbers():
+def test_functions_of_whole_numbers(bits):
     x, y = wholes(3, low=-(2**31), high=2**31 - 1), wholes(3, low=-40, high=40, seed=1)
-    x[: len(ENDS), 0], y[: len(ENDS), 0] = ENDS, ENDS[::-1]
-    x[: len(ENDS), 1], y[: len(ENDS), 1] = ENDS[4], ENDS
+    x, y = widened([x, y], bits)
+    x <<= bits - 32
+    half = 1 << (bits - 1)
+    ends = [0, 1, -1, half - 1, -half, 7, -7]
+    x[: len(ends), 0], y[: len(ends), 0] = ends, ends[::-1]
+    x[: len(ends), 1], y[: len(ends), 1] = ends[4], ends
     found, expected = both(WHOLE, [x, y])
     assert_close(found, expected)
     found, expected = both(WHOLE_ROWS, [x])
     assert_close(found, expected)
 
 
-def test_functions_of_random_keys():
+def test_functions_of_random_keys(bits):
     keys = np.random.default_rng(0).integers(0, 2**32, (COUNT, 2), np.uint64).astype(np.uint32)
     found, expected = both(RANDOM, [keys])
     assert_close(found, expected)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helpers import smooth_functions
+from helpers.further import slow_unless
 from helpers.smooth_functions import BLOCKS, MOVES, SmoothFunction
 from onekernel import cpu, fuse
 from onekernel.lower import control_flow
@@ -14,6 +15,8 @@ pytestmark = pytest.mark.skipif(cpu.obstacle() is not None, reason="there are no
 
 BATCH = 25  # functions in one test
 BATCHES = 40
+BATCHES_IN_FLOAT64 = 10
+QUICK = (0, 2, 3)
 INSTANCES = 2
 STEP = 2e-3
 """Of the first differences."""
@@ -21,8 +24,11 @@ STEP = 2e-3
 STEADY = 1e-7
 """Differences of two steps that are farther apart, as a part of the derivative, measure nothing."""
 
-PRECISE, CLOSE = 1e-6, 1e-4
-"""What JAX's derivatives in float64 may differ by from differences, and kernels' from JAX's."""
+PRECISE = 1e-6
+"""What derivatives in float64 may differ by from differences, as a part of them."""
+
+CLOSE = {np.float32: 1e-4, np.float64: 1e-10}
+"""What those of kernels may differ by from JAX's."""
 
 SOONEST = {}
 """Options with which XLA compiles soonest."""
@@ -68,26 +74,29 @@ def differences(function, x, direction):
     return fine if abs(coarse - fine) <= STEADY * abs(fine) else None
 
 
-def compare(function, has_reverse_mode, seed):
-    """Check a function's derivative; return whether differences could measure it."""
+def compare(function, has_reverse_mode, seed, dtype):
+    """Check a function's derivative in a dtype; return whether differences could measure it."""
     points = smooth_functions.inputs(seed, INSTANCES)
     direction = np.random.default_rng(seed).normal(size=points.shape[1])
     along = derivative(function, direction, has_reverse_mode)
     precise = one_by_one(along, points, np.float64)
-    theirs = one_by_one(along, points, np.float32)
+    theirs = one_by_one(along, points, dtype)
     one = fuse(function, on_unsupported="raise")
     run = jax.jit(jax.vmap(derivative(one, direction, has_reverse_mode)))
-    ours = np.asarray(run(np.float32(points)))
+    with jax.enable_x64(dtype == np.float64):
+        ours = np.asarray(run(dtype(points)))
+    assert ours.dtype == dtype
     # A function may enlarge round-off: by how much, the error of float32 tells.
-    allowed = CLOSE * np.abs(precise).max() + 4 * np.abs(theirs - precise).max()
+    allowed = CLOSE[dtype] * np.abs(precise).max() + 4 * np.abs(theirs - precise).max()
     assert np.abs(ours - theirs).max() <= allowed, f"{ours}, not {theirs}, precisely {precise}"
     found = differences(function, points[0], direction)
     if found is not None:
-        assert abs(found - precise[0]) <= PRECISE * abs(found), f"{precise[0]}, not {found}"
+        ours = ours if dtype == np.float64 else precise
+        assert abs(found - ours[0]) <= PRECISE * abs(found), f"{ours[0]}, not {found}"
     return found is not None
 
 
-def check(seed, monkeypatch):
+def check(seed, monkeypatch, dtype=np.float32):
     """Check the function of a seed, of which every fourth has no reverse mode."""
     has_reverse_mode = seed % 4 > 0
     function = SmoothFunction(seed, has_reverse_mode)
@@ -97,7 +106,7 @@ def check(seed, monkeypatch):
             patch.setattr(control_flow, "MIN_BRANCH_OPERATIONS", 2)
             patch.setattr(control_flow, "MAX_UNROLLED_OPERATIONS", 8)
         try:
-            return compare(function, has_reverse_mode, seed)
+            return compare(function, has_reverse_mode, seed, dtype)
         except Exception as error:
             lines = "\n".join(function.text)
             raise AssertionError(f"seed {seed}: {error}\n{lines}") from error
@@ -125,7 +134,19 @@ def test_all_kinds_of_operations_have_jaxs_gradient(name, monkeypatch):
     points = np.float32(smooth_functions.inputs(3, 10)).reshape(2, 5, -1)
     ours = gradients(fuse(KINDS[name], on_unsupported="raise"))(*points)
     for one, other in zip(ours, gradients(KINDS[name])(*points), strict=True):
-        np.testing.assert_allclose(one, other, rtol=CLOSE, atol=CLOSE * np.abs(other).max())
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("seed", slow_unless(QUICK.__contains__, range(BATCH)))
+def test_derivatives_in_float64_are_what_differences_make_of_them(seed, monkeypatch):
+    check(seed, monkeypatch, np.float64)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("batch", range(BATCHES_IN_FLOAT64))
+def test_more_derivatives_in_float64_are_what_differences_make_of_them(batch, monkeypatch):
+    seeds = range(BATCH * (batch + 1), BATCH * (batch + 2))
+    assert sum(check(seed, monkeypatch, np.float64) for seed in seeds) > 0.6 * BATCH
 
 
 @pytest.mark.slow
