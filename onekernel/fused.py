@@ -101,8 +101,8 @@ def fuse(
 
     Args:
       function: a pure JAX function of one instance. Its arguments and results are pytrees of
-        float32, int32, uint32, bool and random keys. It is traced once for all arguments of the
-        same shapes.
+        float32, int32, uint32, bool and random keys, and with `jax_enable_x64` of float64, int64
+        and uint64. It is traced once for all arguments of the same shapes and dtypes.
       on_unsupported: what to do if the function cannot be one kernel: "warn" says once why, and
         XLA computes it; "xla" is silent; "raise" raises the error; a function is called with it.
       may_be_kernel: returns whether there may be a kernel. It is asked when the function is called:

@@ -82,4 +82,4 @@ def _product(a: Array, b: Array) -> tuple[Array, Array]:
     """Return a · b and its rounding error."""
     (a1, a2), (b1, b2) = halves(a), halves(b)
     product = a * b
-    return product, ((a1 * b1 - product) + (a1 * b2 + a2 * b1)) + a2 * b2
+    return product, ((a1 * b1 - product + a1 * b2) + a2 * b1) + a2 * b2

@@ -222,12 +222,7 @@ def scalarize_part(
     Raises:
       UnsupportedError: as `scalarize`, or the function does more than return results.
     """
-    # Reject what cannot be lowered at all.
-    if closed.effects:
-        # For example `jax.debug.print`, on which no result depends.
-        error = UnsupportedError(f"an effect: {', '.join(map(str, closed.effects))}")
-        error.place = next((_place(x) for x in closed.jaxpr.eqns if x.effects), None)
-        raise error
+    _reject_effects(closed)
     # Start with the program's arguments, each split into scalars of the graph.
     graph = make_graph(finite=finite, approximate=approximate)
     lowering = _JaxprLowering(graph)
@@ -256,6 +251,15 @@ def scalarize_part(
         raise UnsupportedError(f"{program.size:,} operations, more than {MAX_PROGRAM_OPERATIONS:,}")
     check_bytes(program.array_bytes)
     return program
+
+
+def _reject_effects(closed: ClosedJaxpr) -> None:
+    """Raise an `UnsupportedError` if a function does more than return results."""
+    if closed.effects:
+        # For example `jax.debug.print`, on which no result depends.
+        error = UnsupportedError(f"an effect: {', '.join(map(str, closed.effects))}")
+        error.place = next((_place(x) for x in closed.jaxpr.eqns if x.effects), None)
+        raise error
 
 
 def word_shape(shape: Sequence[int], dtype: np.dtype, words: bool = True) -> tuple[int, ...]:

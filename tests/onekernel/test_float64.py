@@ -10,6 +10,7 @@ import pytest
 from jax.scipy import special
 
 from onekernel import UnsupportedError, cpu, default_backend, fuse
+from onekernel.kernel import Kernel
 
 pytestmark = pytest.mark.skipif(default_backend() is None, reason="no back end for kernels")
 
@@ -342,6 +343,7 @@ def test_a_kernel_of_one_setting_is_not_that_of_another():
 def test_without_the_setting_no_number_has_64_bits():
     with jax.enable_x64(False):
         kernel = fuse(lambda x: jnp.sin(x) ** 1.3 * 2, on_unsupported="raise").lowered(1.0).one
+        assert isinstance(kernel, Kernel)
         assert all(x.dtype.itemsize <= 4 for x in kernel.program.block.values())
 
 

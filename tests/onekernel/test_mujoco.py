@@ -247,6 +247,15 @@ def test_debug_nans_finds_a_state_that_is_not_finite(falls):
         falls(state, [])
 
 
+def test_a_step_in_float64_is_refused(falls):
+    with jax.enable_x64(True):
+        step = fuse_mjx(falls.mj_model)
+        with pytest.raises(KernelError, match="takes float32 only, not float64"):
+            step(step.init(), jnp.zeros(falls.mj_model.nu))
+        # What was made before stays of float32.
+        assert falls(falls.init(), jnp.zeros(falls.mj_model.nu)).qpos.dtype == np.float32
+
+
 def test_wrong_arguments_are_named():
     model = mujoco.MjModel.from_xml_string(FALLS)
     with pytest.raises(TypeError, match=r"mj_model is a str, not a mujoco\.MjModel"):

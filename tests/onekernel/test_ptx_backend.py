@@ -11,7 +11,7 @@ from helpers.kernel_cases import FUNCTIONS, SCANS, VECTOR, robots
 from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.build import make_env
-from onekernel import gpu
+from onekernel import fuse, gpu
 from onekernel.kernel import Kernel
 from onekernel.lower.jaxpr import scalarize
 
@@ -40,6 +40,71 @@ def test_it_is_compiled_for_every_architecture(name, architecture):
     assert text.count("ld.global") <= 4
     assert not re.search(r"\b(ld|st)\.local", text)
     assert "call" not in text
+
+
+def elementary(x):
+    """Functions of float64, with the angles of any size."""
+    return (
+        jnp.sin(x * 1e7) + jnp.exp(-x * x) * jnp.log1p(jnp.abs(x)),
+        jnp.arctan2(x, x[::-1]) + jnp.abs(x) ** x + jax.lax.erf_inv(x / 9),
+        jnp.maximum(x, x[::-1]) + jnp.round(x) + jnp.sqrt(jnp.abs(x)) + jnp.fmod(x, 0.3),
+    )
+
+
+def whole(x):
+    """Whole numbers of 64 bits, with and without a sign, and their conversions."""
+    n = (x * 2.0**40).astype(jnp.int64)
+    word = jax.lax.bitcast_convert_type(x, jnp.uint64)
+    divided = n // (n[::-1] | 1), word % (word[::-1] | jnp.uint64(1))
+    return n * 3, word >> 7, *divided, word.astype(x.dtype), word.astype(jnp.float32), n << n
+
+
+def rows(x):
+    """A scan whose rows are in memory, and a number of them at a computed place."""
+    end, found = jax.lax.scan(lambda c, i: (c * 0.5 + i, (c, i > 40)), x, jnp.arange(80.0))
+    return end, found[0][jnp.abs(x[0]).astype(int) % 80], found[1].sum()
+
+
+WIDE = {
+    "elementary": elementary,
+    "whole": whole,
+    "rows": rows,
+    "gradient": jax.grad(lambda x: (jnp.tanh(x) * x[::-1]).sum()),
+    "random": lambda x: jax.random.normal(jax.random.key(x[0].astype(int)), (2,)) * x[0],
+}
+"""Functions of a vector of float64."""
+
+
+@pytest.fixture
+def wide():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.mark.parametrize("architecture", [70, 80, 90])
+@pytest.mark.parametrize("name", WIDE)
+def test_numbers_of_64_bits_are_compiled_for_every_architecture(name, architecture, wide):
+    fused = fuse(WIDE[name], on_unsupported="raise")
+    one = fused.lowered(jax.ShapeDtypeStruct((4,), jnp.float64)).one
+    assert isinstance(one, Kernel)
+    text = gpu.compiled(one, architecture)
+    assert f".target sm_{architecture}" in text
+    assert re.search(r"\.(f64|s64|u64)", text)
+    assert "call" not in text
+    # A number of 64 bits is read and written as two words.
+    assert text.count("st.global") == sum(one.result_words)
+    assert text.count("ld.global.b32") >= 2
+
+
+@on_a_gpu
+@pytest.mark.parametrize("name", WIDE)
+def test_numbers_of_64_bits_are_those_of_jax(name, wide):
+    x = np.random.default_rng(0).normal(size=(300, 4))
+    ours = jax.jit(jax.vmap(fuse(WIDE[name], on_unsupported="raise")))(x)
+    theirs = jax.jit(jax.vmap(WIDE[name]))(x)
+    for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", SCANS)
