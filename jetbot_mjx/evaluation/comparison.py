@@ -123,7 +123,7 @@ class Comparison(NamedTuple):
 
     def to_json(self) -> JsonObject:
         """Return everything except the episodes as JSON values."""
-        return comparison_json(self._asdict(), "policy", "mujoco")
+        return comparison_json(self._asdict(), "policy", "mujoco", "best_known")
 
 
 def comparison_json(values: JsonObject, *of_each_seed: str) -> JsonObject:

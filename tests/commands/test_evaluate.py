@@ -299,7 +299,8 @@ def test_a_file_without_ranges_is_refused(judged, root):
 def test_figures_are_drawn_for_light_and_dark_surroundings(judged):
     _, folder, _, _ = judged
     page = (folder / "report.html").read_text("utf-8")
-    dark, light = re.search(r'srcset="([^"]+)">\s*<img src="([^"]+)"', page).groups()
+    pair = r'<img class="light" src="([^"]+)" alt="[^"]+">\s*<img class="dark" src="([^"]+)"'
+    light, dark = re.search(pair, page).groups()
     assert dark != light
     assert Image.open(folder / "by_goal.png").convert("RGB").getpixel((0, 0)) == (255, 255, 255)
 

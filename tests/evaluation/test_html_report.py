@@ -1,19 +1,25 @@
 """Reports and comparisons on small screens: tables scroll, and the page does not."""
 
+import io
 import json
 import re
 from html.parser import HTMLParser
+from unittest import mock
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from helpers import chromium
-from helpers.reports import make_episodes, make_report, polar
+from helpers.reports import make_episodes, make_report, polar, return_report_of
 from helpers.unpainted import unpainted
 from jetbot_mjx.envs import OTHER_NUMERICS
+from jetbot_mjx.evaluation import plots
 from jetbot_mjx.evaluation.comparison import compare
-from jetbot_mjx.evaluation.curves import CurvePoint
+from jetbot_mjx.evaluation.curves import CurvePoint, ReturnPoint
 from jetbot_mjx.evaluation.html_report import write_comparison, write_report
+from jetbot_mjx.evaluation.report import BestKnown, TimeGap
+from jetbot_mjx.evaluation.return_report import compare_returns
 from jetbot_mjx.evaluation.robustness import SWEEPS, MujocoResult, SweepResult
 from jetbot_mjx.evaluation.tables import summarize_comparison, summarize_report
 
@@ -28,9 +34,9 @@ VERSIONS = {
 }
 
 
-def report_of(folder, won, name=LONG_RUN):
+def report_of(folder, won, name=LONG_RUN, settings=None):
     goals = polar(np.linspace(0.3, 1.2, len(won)), np.linspace(-170, 170, len(won)))
-    report = make_report(make_episodes(goals, won), folder / name)
+    report = make_report(make_episodes(goals, won), folder / name, settings=settings)
     return report._replace(
         folder=folder / name / "report",
         versions=VERSIONS,
@@ -87,6 +93,64 @@ def test_a_comparison_has_both_simulators_pictures_of_policies_that_see(tmp_path
         assert rows == [("plain", "100.00"), ("varied", "66.67")]
         assert "blind in C MuJoCo" not in text
         assert "on the first 3 goals" in text
+
+
+def test_a_comparison_has_the_best_known_times_as_the_terminal_has(tmp_path):
+    report = report_of(tmp_path, np.ones(6))
+    best = BestKnown(1.28, 1.72, TimeGap(-180.0, 180.0, 6, 1.3, 1.26, 0.03), ())
+    found = {
+        known: compare(
+            tmp_path / str(known),
+            {
+                name: {"seed-0": report._replace(best_known=best if known else None)}
+                for name in ("one", "other")
+            },
+        )
+        for known in (True, False)
+    }
+    for known, comparison in found.items():
+        with unpainted():
+            page = write_comparison(comparison)
+        for path in (page, page.with_suffix(".md")):
+            rows = re.findall(r"best known[-| ]+([\d.]+) s[| ]*([\d.]+) s", text_of(path))
+            assert rows == [("1.28", "1.72")] * known
+            assert ("an open-loop search" in text_of(path)) is known
+        seed = json.loads(page.with_suffix(".json").read_text())["runs"][1]["seeds"][0]
+        assert (seed["best_known"] is not None) is known
+
+
+@pytest.mark.parametrize("kind", ["goals", "starts"])
+@pytest.mark.parametrize(
+    ("counts", "said"),
+    [
+        ((64, 64), "same {} at every checkpoint and in every run. Band"),
+        (
+            (256, 64, 256),
+            "same {} at every checkpoint."
+            " The runs have 64 or 256 {}, of which the first 64 are the same. Band",
+        ),
+    ],
+)
+def test_evaluations_of_which_runs_share_the_first_ones_only_are_not_called_equal(
+    tmp_path, kind, counts, said
+):
+    settings = {f"run-{i}": {"evaluation": {"episodes": n}} for i, n in enumerate(counts)}
+    if kind == "goals":
+        runs = {
+            name: {"seed-0": report_of(tmp_path, np.ones(2), name, own)}
+            for name, own in settings.items()
+        }
+        comparison = compare(tmp_path, runs)
+    else:
+        curve = (ReturnPoint(2048, 1.0, 0.9, 1.1),)
+        runs = {
+            name: {"seed-0": return_report_of([1.0], curve=curve, **own)}
+            for name, own in settings.items()
+        }
+        comparison = compare_returns(tmp_path, runs)._replace(versions=VERSIONS)
+    with unpainted():
+        page = write_comparison(comparison)
+    assert said.format(kind, kind) in text_of(page)
 
 
 class Tables(HTMLParser):
@@ -188,3 +252,32 @@ def test_no_page_scrolls_sideways(browser, pages, which, width):
     browser.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
     found = json.loads(browser.evaluate(LOOK))
     assert found == {"page": 0, "outside": [], "tall": [], "broken": []}
+
+
+SHOWN = """(() => {
+  const shown = e => e.getBoundingClientRect().height > 0;
+  const images = [...document.querySelectorAll('figure img')].filter(shown);
+  return JSON.stringify(images.map(e => e.naturalWidth));
+})()"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_pages_are_dark_on_a_dark_screen_and_light_on_paper(tmp_path, scheme):
+    if chromium.find() is None:
+        pytest.skip("no Chromium to look at the page with")
+    widths = {"light": 11, "dark": 13}
+
+    def painted(figure):
+        """Return a picture whose width tells the theme that it was drawn in."""
+        width = widths["light" if figure.get_facecolor()[0] > 0.5 else "dark"]
+        png = io.BytesIO()
+        Image.new("RGB", (width, 7), "white").save(png, "png")
+        return png.getvalue()
+
+    with mock.patch.object(plots, "to_png", painted):
+        page = write_report(report_of(tmp_path, np.ones(6)))
+    with chromium.browse(tmp_path / "chromium", dark=scheme == "dark") as browser:
+        browser.open_and_wait(page.as_uri())
+        assert json.loads(browser.evaluate(SHOWN)) == [widths[scheme]] * 4
+        printed = re.findall(rb"/Subtype /Image\s+/Width (\d+)", browser.print())
+    assert {int(width) for width in printed} == {widths["light"]}

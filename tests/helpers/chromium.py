@@ -57,6 +57,11 @@ class Page:
             mobile=True,
         )
 
+    def print(self):
+        """Return the page as it is printed, a PDF."""
+        done = self._call("Page.printToPDF", printBackground=True)
+        return base64.b64decode(done["data"])
+
     def evaluate(self, source):
         done = self._call("Runtime.evaluate", expression=source, returnByValue=True)
         return done["result"].get("value")
@@ -135,8 +140,11 @@ class Page:
 
 
 @contextlib.contextmanager
-def browse(folder):
-    """A page of a browser that keeps its files in a folder."""
+def browse(folder, *, dark=False):
+    """A page of a browser that keeps its files in a folder, for a user of dark pages or of light.
+
+    Colours that DevTools emulate instead would be chosen again before printing.
+    """
     from websockets.sync.client import connect
 
     port_file = folder / "DevToolsActivePort"
@@ -154,6 +162,7 @@ def browse(folder):
         "--disable-component-update",
         "--disable-sync",
         "--no-first-run",
+        f"--blink-settings=preferredColorScheme={0 if dark else 1}",
     ]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
