@@ -125,9 +125,9 @@ def test_a_comparison_has_the_best_known_times_as_the_terminal_has(tmp_path):
     [
         ((64, 64), "same {} at every checkpoint and in every run. Band"),
         (
-            (256, 64, 256),
+            (1024, 64, 1024),
             "same {} at every checkpoint."
-            " The runs have 64 or 256 {}, of which the first 64 are the same. Band",
+            " The runs have 64 or 1,024 {}, of which the first 64 are the same. Band",
         ),
     ],
 )
