@@ -57,7 +57,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.prepare_device()
     name = Path(f"tune-{options.config.stem}")
     with cli.show_progress(), claim_run_dir(options.output, name) as folder:
-        cli.tell(f"results: {folder}, where the same command with --output continues if stopped")
         found = run_search(
             config,
             space,

@@ -92,7 +92,7 @@ def run_search(
         nothing, and the best trial is the best.
       objective: as for `Search`.
       storage: a database URL; None: SQLite in the folder.
-      say: called with one line about each round.
+      say: called with one line about the folder and one about each round.
 
     Returns:
       The result.
@@ -101,6 +101,11 @@ def run_search(
       UserError: as for `Search`, its methods `run` and `confirm`, and `write_results`.
     """
     search = Search(config, space, folder, objective=objective, storage=storage, say=say)
+    # Only now: a search that cannot begin leaves nothing to continue.
+    say(
+        f"results: {folder}, where the same command with --output (in Python: output) continues"
+        " if stopped"
+    )
     search.run(trials, round_size)
     say(f"search finished after {process_seconds():.1f} s")
     entrants = search.confirm(confirm, CONFIRM_SEEDS, round_size)

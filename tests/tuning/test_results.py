@@ -37,8 +37,9 @@ def test_a_search_in_an_environment_maximises_the_return(tmp_path):
     said = []
     folder = tmp_path / "found"
     found = run_search(config, space, folder, trials=2, round_size=2, confirm=1, say=said.append)
+    assert said[0].startswith(f"results: {folder}, where the same command with --output ")
     # Every reward is at most 1, and an episode has 16.
-    assert re.match(r"2 of 2 trials, best mean return 1\d\.\d\d; this round of 2 took", said[0])
+    assert re.match(r"2 of 2 trials, best mean return 1\d\.\d\d; this round of 2 took", said[1])
     best = found.best
     assert (best.scored_by, best.mean_seconds) == ("return", (None,) * 5)
     assert all(10 < score <= 16 for score in best.scores)
