@@ -218,6 +218,22 @@ def test_a_cost_of_steps_is_told_beside_the_return(tmp_path):
     assert "Each step costs 0.02 m of the return." in page.with_suffix(".md").read_text("utf-8")
 
 
+def test_returns_of_other_costs_are_not_told_beside_each_other(tmp_path):
+    cheap = report_of(tmp_path, np.ones(2), "cheap")
+    task = cheap.config.task.model_copy(update={"step_cost": 0.02})
+    costly = report_of(tmp_path, np.ones(2), "costly")
+    costly = costly._replace(config=cheap.config.model_copy(update={"task": task}))
+    told = f"{cheap.policy.episode_return:+.3f} m"
+    for other, is_told in ((report_of(tmp_path, np.ones(2), "other"), True), (costly, False)):
+        runs = {"a": {"seed-0": cheap}, "b": {"seed-0": other}}
+        with unpainted():
+            page = write_comparison(compare(tmp_path / "comparison", runs))
+        rows = page.read_text("utf-8").partition("Every policy")[2].partition("</table>")[0]
+        assert (told in rows) == is_told
+        text = page.with_suffix(".md").read_text("utf-8")
+        assert (f"{told} |" in text.partition("Every policy")[2]) == is_told
+
+
 LOOK = """(() => {
   const width = document.documentElement.clientWidth;
   const scrolls = e =>
