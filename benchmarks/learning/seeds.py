@@ -31,12 +31,14 @@ from jetbot_mjx import cli, evaluation, training
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.config.yaml_text import read_yaml
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.best_known import Kind
 from jetbot_mjx.evaluation.report import compare_with
 from jetbot_mjx.evaluation.robustness import MujocoEvaluator
 from jetbot_mjx.runs import Setup, load_checkpoint
 from jetbot_mjx.runs.run_dir import versions, write_json
 
 _FRESH_SEED = 65_537
+_GAPS: dict[str, Kind] = {"above_best_known": "search", "above_bound": "bound"}
 
 
 def measure(config: Config, fresh: int) -> dict[str, Any]:
@@ -63,7 +65,7 @@ def measure(config: Config, fresh: int) -> dict[str, Any]:
         for checkpoint in checkpoints:
             fixed = jax.device_get(evaluator.run(checkpoint.params, fixed_keys))
             gaps = {}
-            for name, kind in (("above_best_known", "search"), ("above_bound", "bound")):
+            for name, kind in _GAPS.items():
                 found, missing = compare_with(kind, config, fixed)
                 gaps[name] = found.total.gap if found else missing
             unseen = jax.device_get(evaluator.run(checkpoint.params, fresh_keys))
