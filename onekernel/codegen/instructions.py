@@ -230,8 +230,6 @@ def write_of(value: Expr, *, for_gpu: bool = False) -> _Write:
     write = _OPERATIONS.get((value.op, kind))
     if write is None:
         raise UnsupportedError(f"{value.op} of {value.operands[0].dtype}")
-    if write is _angle and value.dtype != np.float32:
-        raise UnsupportedError(f"{value.op} of {value.dtype}")
     if write is _approximation and not for_gpu:
         raise UnsupportedError(f"an approximate {value.op} on a CPU")
     return write

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 
 from onekernel.codegen.instructions import ELEMENTS, Target, write_of
-from onekernel.codegen.writer import LlvmWriter, Value, llvm_type
+from onekernel.codegen.writer import LlvmWriter, Value, llvm_type, vector
 from onekernel.errors import UnsupportedError
 from onekernel.lower import (
     Block,
@@ -35,6 +35,7 @@ from onekernel.lower import (
     PlacedLoop,
     Scalar,
     ScalarProgram,
+    far_angle,
     is_constant,
     is_table,
     length_of,
@@ -42,6 +43,8 @@ from onekernel.lower import (
     recomputable,
     same_size,
 )
+
+_FAR_ANGLES = ("quarter_turns", "angle_rest")
 
 STEP = "step"
 """Name of the function that runs one step, or all items."""
@@ -181,14 +184,14 @@ def require(program: ScalarProgram) -> None:
             write_of(value)
 
 
-def _inputs(program: ScalarProgram) -> list[Expr]:
+def _inputs(program: ScalarProgram, *, is_part: bool = False) -> list[Expr]:
     """Return the scalars of a program's arguments.
 
     Raises:
-      UnsupportedError: one of them is not float32.
+      UnsupportedError: one of them is not float32, and it is no part of a program.
     """
     inputs = [x for array in program.inputs for x in array.ravel()]
-    if any(x.dtype != np.float32 for x in inputs):
+    if not is_part and any(x.dtype != np.float32 for x in inputs):
         raise UnsupportedError("an argument that is not float32")
     return inputs
 
@@ -203,6 +206,7 @@ class ProgramWriter:
         *,
         fast_division: bool = False,
         for_gpu: bool = False,
+        is_part: bool = False,
     ) -> None:
         """Begin without values.
 
@@ -213,11 +217,12 @@ class ProgramWriter:
             place, as a GPU's own instructions for them are.
           for_gpu: whether the function is for an NVIDIA GPU. Only such a function can run a program
             that `scalarize` has lowered with `approximate`.
+          is_part: whether arguments of other dtypes are given as such.
 
         Raises:
           UnsupportedError: an argument is not float32.
         """
-        self._inputs = _inputs(program)
+        self._inputs = _inputs(program, is_part=is_part)
         self._writer = writer
         self._on = Target(writer, "afn" if fast_division else "", for_gpu)
         self._program = program
@@ -538,6 +543,13 @@ class ProgramWriter:
         write = self._load if value.op == "load" else self._computed
         self._values[value.index] = write(value)
 
+    def _far_angle(self, op: str, angle: Value) -> Value:
+        """Append a call of a function that the module has once, and that few angles need."""
+        w = self._writer
+        for line in _far_angle_lines(op, w.lanes, for_gpu=self._on.for_gpu):
+            w.declare(line)
+        return w.call(op, angle, result=angle.type)
+
     def _is_deferred(self, x: Expr) -> bool:
         """Return whether a number is loaded, and its bits converted, wherever it is used.
 
@@ -569,8 +581,20 @@ class ProgramWriter:
         return self._again[key]
 
     def _computed(self, value: Expr) -> Value:
+        if value.op in _FAR_ANGLES and value.dtype == np.float64:
+            return self._far_angle(value.op, self._operand(value.operands[0]))
         write = write_of(value, for_gpu=self._on.for_gpu)
         return write(self._on, value, [self._operand(x) for x in value.operands])
+
+
+@functools.cache
+def _far_angle_lines(op: str, lanes: int, *, for_gpu: bool) -> list[str]:
+    """Return the lines of a module with the function of `quarter_turns` or `angle_rest`."""
+    type = vector("double", lanes)
+    w = LlvmWriter(op, f"{type} x", lanes=lanes, result=type)
+    (result,) = ProgramWriter(w, far_angle(op), for_gpu=for_gpu, is_part=True).finish(w.parameters)
+    w.ret(result)
+    return [*w.declared, w.text()]
 
 
 def _source(x: Scalar) -> Scalar:

@@ -647,9 +647,9 @@ class LlvmWriter:
 
 def _parameter_type(text: str) -> str:
     """Return the type of a parameter from its type and attributes."""
-    # An address in another memory has a type of two words.
-    space = re.match(r"ptr addrspace\(\d+\)", text)
-    return space[0] if space else text.split()[0]
+    # A vector, and an address in another memory, have types of several words.
+    several = re.match(r"ptr addrspace\(\d+\)|<[^>]*>", text)
+    return several[0] if several else text.split()[0]
 
 
 def _mangled(type: str) -> str:

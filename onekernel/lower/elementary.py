@@ -7,7 +7,6 @@ the constants of `_Format`.
 """
 
 import functools
-import itertools
 from collections.abc import Callable
 from decimal import Decimal
 from typing import NamedTuple
@@ -147,75 +146,8 @@ def _any_angle(graph: ExprGraph, x: Scalar) -> list[Scalar]:
     do = graph.apply
     is_far = do("ge", do("abs", x), np.float64(_FAR))
     # A branch costs nothing where all angles are small.
-    sides = _near_angle(graph, _DOUBLE, x), _far_angle(graph, x)
-    return graph.branch(is_far, *sides)
-
-
-def _far_angle(graph: ExprGraph, x: Scalar) -> tuple[Scalar, Scalar]:
-    """Return what `_near_angle` does, of an angle from 2²⁰ on; infinity becomes NaN.
-
-    Source: M. Payne and R. Hanek, Radian reduction for trigonometric functions, 1983.
-    """
-    do, word = graph.apply, np.uint64
-
-    def low(a: Scalar) -> Scalar:
-        return do("and", a, word(2**32 - 1))
-
-    def high(a: Scalar) -> Scalar:
-        return do("shift_right_logical", a, word(32))
-
-    # x = m 2ᵉ with a whole m of 53 bits. The bits of 2/π that are worth 4 quarter turns and more
-    # in the product with 2ᵉ are left out; `first` is the first word that is not.
-    bits = graph.convert(do("bitcast", do("abs", x)), np.dtype(word))
-    whole = do("or", do("and", bits, word(2**52 - 1)), word(2**52))
-    exponent = graph.convert(do("shift_right_logical", bits, word(52)), np.dtype(np.int32))
-    # Lanes whose angle is small have any exponent, but must not read beside the table.
-    place = do(
-        "min", do("max", do("add", exponent, np.int32(62 - 1075)), np.int32(0)), np.int32(1034)
-    )
-    first = do("shift_right_logical", place, np.int32(5))
-    scale = do("shift_left", word(1), graph.convert(do("and", place, np.int32(31)), np.dtype(word)))
-    table = graph.array(_bits_of_turns())
-    found = [graph.load(table, do("add", first, np.int32(i))) for i in range(7)]
-    scaled = [do("mul", graph.convert(each, np.dtype(word)), scale) for each in found]
-    # f = 2ᵉ⁻² · 2/π modulo 1, in words of 32 bits, and then m · f modulo 1: the product of two
-    # words has a high and a low word.
-    f = [do("add", low(a), high(b)) for a, b in itertools.pairwise(scaled)]
-    smaller = [do("mul", low(whole), each) for each in f]
-    larger = [do("mul", high(whole), each) for each in f[1:]]
-    columns = []
-    for i in range(5):
-        total = do("add", do("add", low(smaller[i]), high(smaller[i + 1])), low(larger[i]))
-        columns.append(do("add", total, high(larger[i + 1])) if i < 4 else total)
-    for i in range(3, -1, -1):
-        columns[i] = do("add", columns[i], high(columns[i + 1]))
-    top, rest = (
-        do("or", do("shift_left", columns[i], word(32)), low(columns[i + 1])) for i in (0, 2)
-    )
-    # Two bits are whole quarter turns. What is left is between -½ and ½, by its sign.
-    left = do("or", do("shift_left", top, word(2)), do("shift_right_logical", rest, word(62)))
-    rounded = do(
-        "add", do("shift_right_logical", top, word(62)), do("shift_right_logical", left, word(63))
-    )
-    turns = graph.convert(rounded, _DOUBLE)
-    part = graph.convert(graph.convert(left, np.dtype(np.int64)), _DOUBLE)
-    small = graph.convert(do("shift_left", rest, word(2)), _DOUBLE)
-    r = do("add", part, do("mul", small, np.float64(2.0**-64)))
-    r = do("mul", r, np.float64(np.pi / 2 * 2.0**-64))
-    # The angle of a negative x, and of infinity.
-    is_below = do("lt", x, np.float64(0))
-    turns = graph.select(is_below, turns, do("neg", turns))
-    r = graph.select(is_below, r, do("neg", r))
-    return turns, graph.select(do("is_finite", x), np.float64(np.nan), r)
-
-
-@functools.cache
-def _bits_of_turns() -> list[np.uint32]:
-    """Return the binary digits of 2/π in words of 32 bits, after two words of zeros."""
-    count = 37
-    digits = polynomials.binary_digits_of_turn(32 * count)
-    words = (np.uint32(digits >> (32 * i) & 0xFFFFFFFF) for i in reversed(range(count)))
-    return [np.uint32(0), np.uint32(0), *words]
+    far = do("quarter_turns", x), do("angle_rest", x)
+    return graph.branch(is_far, _near_angle(graph, _DOUBLE, x), far)
 
 
 _EXP = Polynomial(np.exp, 6, -_LN2 / 2, _LN2 / 2, Decimal.exp, 12)

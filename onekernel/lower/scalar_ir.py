@@ -270,8 +270,8 @@ EVALUATE: dict[str, Callable[..., np.ndarray]] = {
 """The NumPy function of every operation except `select` and `convert`. `bitcast` takes the bits of
 a float for an integer with a sign, or the other way round; `fma` is a · b + c, rounded once;
 `round` rounds to the nearest whole number, and half of one to the nearest even. For a float32 angle
-up to 2⁵⁰, `quarter_turns` is the nearest number of quarter turns, modulo 4, and `angle_rest` the
-angle that is left, between -π/4 and π/4."""
+up to 2⁵⁰ and a float64 one from 1/4 on, `quarter_turns` is the nearest number of quarter turns,
+modulo 4, and `angle_rest` the angle that is left, between -π/4 and π/4."""
 
 MAX_OPERATIONS = 1_000_000
 """Largest number of recorded operations, including those that nothing depends on."""
