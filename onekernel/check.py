@@ -143,8 +143,8 @@ def _decided(result: np.ndarray, shaken: Sequence[np.ndarray]) -> np.ndarray:
       result: a result of several instances, (instances, ...).
       shaken: the same, each computed with other round-off.
     """
-    plain = result.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
+        plain = result.astype(np.float64)
         moves = np.max([np.abs(np.where(x == result, 0, x - plain)) for x in shaken], axis=0)
         # A number that is finite in some evaluations only moves without end.
         steady = np.all([np.isnan(x) == np.isnan(plain) for x in shaken], axis=0)

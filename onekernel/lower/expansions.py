@@ -358,12 +358,15 @@ def _conv_general_dilated(
     feature_group_count: int,
     batch_group_count: int,
 ) -> Array:
-    if batch_group_count != 1:
-        raise UnsupportedError("a convolution with groups of batches")
     # Bring the axes into the order (batch, channels, space ...), and (outputs, inputs, space ...).
     x = x.transpose(dimension_numbers.lhs_spec)
     kernel = kernel.transpose(dimension_numbers.rhs_spec)
     groups, outputs, inputs = feature_group_count, *kernel.shape[:2]
+    if batch_group_count > 1:
+        # Groups of images are groups of the channels of fewer images.
+        groups = batch_group_count
+        x = x.reshape(groups, -1, *x.shape[1:]).swapaxes(0, 1)
+        x = x.reshape(len(x), groups * inputs, *x.shape[3:])
     # Pad the image, also between its numbers (a transposed convolution).
     inside = [by - 1 for by in lhs_dilation]
     widths = [(low, high, n) for (low, high), n in zip(padding, inside, strict=True)]

@@ -217,6 +217,20 @@ MATRICES = {
     "power": lambda a: jnp.linalg.matrix_power(a / 5, 5),
 }
 
+
+def filtered(x, outputs, channels, **keywords):
+    """Return four images of two channels, whose filter is a part of them."""
+    filters = x[: outputs * channels * 3].reshape(outputs, channels, 3)
+    return jax.lax.conv_general_dilated(x.reshape(4, 2, 5), filters, (1,), "SAME", **keywords)
+
+
+IMAGES = {
+    "filtered": lambda x: filtered(x, 3, 2),
+    "with gaps": lambda x: filtered(x, 3, 2, rhs_dilation=(2,)),
+    "each channel": lambda x: filtered(x, 4, 1, feature_group_count=2),
+    "groups of images": lambda x: filtered(x, 4, 2, batch_group_count=2),
+}
+
 DERIVATIVES = {
     "gradient": jax.grad(lambda x: jnp.sum(jnp.sin(x) ** 2 * x)),
     "second": jax.hessian(lambda x: jnp.sum(x**3) * x[0]),
@@ -250,6 +264,7 @@ GROUPS = {
     "indices": (INDEXED, [floats(7), wholes()]),
     "matrices": (MATRICES, [conditioned(4)]),
     "derivatives": (DERIVATIVES, [floats(6)]),
+    "images": (IMAGES, [floats(40)]),
 }
 
 
