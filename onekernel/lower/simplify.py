@@ -92,7 +92,10 @@ def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
         return x
     # Multiply by the reciprocal instead, since a division takes several times as long.
     if is_constant(y) and dtype.kind == "f" and y != 0:
-        return graph.apply("mul", x, dtype.type(1 / np.float64(y)))
+        reciprocal = dtype.type(1 / np.float64(y))
+        # That of one of the largest numbers may be too small for a processor.
+        if not 0 < abs(reciprocal) < np.finfo(dtype).tiny:
+            return graph.apply("mul", x, reciprocal)
     return None
 
 

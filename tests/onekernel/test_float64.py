@@ -239,6 +239,12 @@ def test_known_whole_numbers_are_those_of_jax():
         np.testing.assert_array_equal(one[0], other)
 
 
+@pytest.mark.parametrize(("dtype", "large"), [(np.float32, 3e38), (np.float64, 1.7e308)])
+def test_a_division_by_one_of_the_largest_numbers_is_one(dtype, large):
+    x = np.array([large, -large, large / 2], dtype)
+    np.testing.assert_array_equal(run(lambda x: x / dtype(large), x), [1, -1, 0.5])
+
+
 def test_remainders_are_exact():
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-1e6, 1e6, (2, 3000)) * 10.0 ** rng.integers(-5, 1, (2, 3000))
@@ -276,7 +282,17 @@ def tables(x, i):
     table = jnp.arange(300) ** 2 * 0.25
     words = jnp.array([0.25, 0.0, 1e300, np.nan])
     _, rows = jax.lax.scan(lambda c, v: (c + v, (c * v, c > v, v.astype(int))), x[0], x[:70])
-    return table[i * 30], words[i % 4], x[i], x.at[i].add(1.0), x[i * 9 % 70], rows, jnp.roll(x, i)
+    places = jnp.arange(400)[i * 30] * 2**40
+    return (
+        table[i * 30],
+        places,
+        words[i % 4],
+        x[i],
+        x.at[i].add(1.0),
+        x[i * 9 % 70],
+        rows,
+        jnp.roll(x, i),
+    )
 
 
 def test_arrays_in_memory_hold_numbers_of_64_bits():
