@@ -92,7 +92,9 @@ class Parser(argparse.ArgumentParser):
           word: the argument, perhaps with a value, such as `num_envs=128` or `--num_envs`.
           option: the name of the argument if it is an option, such as `--num_envs`.
         """
-        close = difflib.get_close_matches(option, self._option_string_actions, n=1, cutoff=0.65)
+        # Nobody shall be told by a mistake in spelling to run the code of others.
+        known = self._option_string_actions.keys() - {"--trust"}
+        close = difflib.get_close_matches(option, sorted(known), n=1, cutoff=0.65)
         if "--set" in self._option_string_actions:
             # Only to explain an error: it takes longer than the rest of the parser.
             from jetbot_mjx.config import keys_meant_by

@@ -186,7 +186,7 @@ def robustness_table(report: Report) -> str:
 def runs_table(comparison: Comparison) -> str:
     """Return a table of the results of each run over its seeds."""
     rows = [
-        ("", "success, mean", "interquartile mean", "time to goal, mean", "95 % intervals over")
+        ("", "success, mean", "interquartile mean", "median time to goal", "95 % intervals over")
     ]
     rows += [
         (

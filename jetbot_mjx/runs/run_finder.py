@@ -262,6 +262,8 @@ def format_score(run: RunInfo) -> str:
 def copy_pretrained(folder: Path) -> tuple[Path, ...]:
     """Copy the runs that come with the package, without overwriting anything.
 
+    Commands that take `pretrained:NAME` write pages and reports into the same folders: they stay.
+
     Args:
       folder: The folder in which each run gets a folder of its own.
 
@@ -272,12 +274,20 @@ def copy_pretrained(folder: Path) -> tuple[Path, ...]:
       UserError: one of them exists already, or cannot be written.
     """
     runs = {path: folder / path.name for path in sorted(PRETRAINED.iterdir())}
-    for target in runs.values():
-        if target.exists():
+    for source, target in runs.items():
+        parts = [target / path.name for path in source.iterdir()]
+        if target.is_file() or any(map(os.path.lexists, parts)):
             raise UserError(f"{target} exists already: choose another folder with --output")
     for source, target in runs.items():
-        with atomic_folder(target) as unfinished:
-            shutil.copytree(source, unfinished, dirs_exist_ok=True)
+        # A folder that is there already holds results, and stays.
+        new = target / "checkpoints" if target.exists() else target
+        with atomic_folder(new) as unfinished:
+            if new == target:
+                shutil.copytree(source, unfinished, dirs_exist_ok=True)
+            else:  # without checkpoints it is no run: they come last
+                others = shutil.ignore_patterns("checkpoints")
+                shutil.copytree(source, target, ignore=others, dirs_exist_ok=True)
+                shutil.copytree(source / "checkpoints", unfinished, dirs_exist_ok=True)
     return tuple(runs.values())
 
 

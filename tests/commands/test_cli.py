@@ -420,3 +420,11 @@ def test_a_mistake_costs_one_line(tmp_path, arguments, said):
     assert len(process.stderr.splitlines()) == 1
     assert said in process.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_no_mistake_is_answered_by_trust(capsys):
+    with pytest.raises(SystemExit):
+        COMMANDS["render"].main(["runs/mine", "--truts"])
+    said = capsys.readouterr().err
+    assert "unrecognized arguments: --truts" in said
+    assert "did you mean --trust" not in said

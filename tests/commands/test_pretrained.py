@@ -119,6 +119,17 @@ def test_nothing_is_overwritten(runs):
     assert not runs[0].exists()
 
 
+def test_results_that_commands_wrote_about_a_run_stay_beside_it(tmp_path):
+    page = tmp_path / "best" / "page.html"
+    page.parent.mkdir()
+    page.write_text("a page")
+    for run in copy_pretrained(tmp_path):
+        assert load_checkpoint(run).env_steps > 0
+    assert page.read_text() == "a page"
+    with pytest.raises(UserError, match="best exists already: choose"):
+        copy_pretrained(tmp_path)
+
+
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"file/runs/best cannot be written: Not a dir"):
