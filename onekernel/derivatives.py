@@ -67,7 +67,7 @@ class Derivatives:
 
     def __init__(
         self,
-        kernel: Kernel,
+        function: Callable[..., list[Array]],
         arguments: Sequence[ShapedArray],
         results: Sequence[ShapedArray],
         *,
@@ -78,8 +78,8 @@ class Derivatives:
         """Prepare the derivatives of a kernel; they are made when they are needed.
 
         Args:
-          kernel: the kernel. Its `fallback` is what is differentiated.
-          arguments: those of one instance for which that was traced.
+          function: what the kernel computes, which JAX can differentiate; of flat arrays.
+          arguments: those of one instance.
           results: likewise.
           trace: traces a function of flat arrays.
           make: returns a traced function as a kernel that is lowered when it is compiled, with
@@ -87,7 +87,7 @@ class Derivatives:
           is_ready: is called with a kernel that will certainly be compiled; it lowers it, and
             returns whether it can be one. Otherwise XLA computes that derivative.
         """
-        self._kernel, self._trace, self._make, self._is_ready = kernel, trace, make, is_ready
+        self._function, self._trace, self._make, self._is_ready = function, trace, make, is_ready
         self._arguments, self._results = arguments, results
         self._divided = functools.cache(self._divide)
         self._transposed = functools.cache(self._transpose)
@@ -199,7 +199,7 @@ class Derivatives:
         moving, still = _split(moves, arguments)
 
         def function(*moving: Array) -> tuple[list[Array], list[Array]]:
-            return _split(floats, self._kernel.fallback(*_merge(moves, moving, still)))
+            return _split(floats, self._function(*_merge(moves, moving, still)))
 
         results, linear, others = jax.linearize(function, *moving, has_aux=True)
         return _merge(floats, results, others), linear
@@ -221,7 +221,7 @@ class Derivatives:
             others, coming = arrays[: len(known)], list(arrays[len(known) :])
 
             def forward(*moving: Array) -> list[Array]:
-                return _split(given, self._kernel.fallback(*_merge(unknown, moving, others)))[0]
+                return _split(given, self._function(*_merge(unknown, moving, others)))[0]
 
             return jax.linear_transpose(forward, *linear)(coming)
 

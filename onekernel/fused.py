@@ -41,17 +41,21 @@ from onekernel.backends import default_backend
 from onekernel.check import check
 from onekernel.derivatives import Derivatives
 from onekernel.errors import KernelError, UnsupportedError
-from onekernel.kernel import Kernel, is_debugging, varying_alike, varying_axes
+from onekernel.kernel import Kernel, inlined, is_debugging, varying_alike, varying_axes
 from onekernel.keys import with_key, without_key, words_of
 from onekernel.traced import (
     arguments_of,
+    as_passed,
     dtypes_of,
     kernel_of,
+    kernels_in,
     passed_avals,
     received,
     to_pass,
     whole_kernel_of,
 )
+
+_DERIVATIVE = "the derivative of "
 
 CHECK = "ONEKERNEL_CHECK"
 """Environment variable: with `1`, kernels are checked before their first use."""
@@ -284,44 +288,94 @@ class Fused:
             # object.
             if not one.before:
                 one.explain, one.on_fallback = self._explain, self._on_fallback
-                one.derivatives = self._derivatives(one, traced, places)
+                self._differentiate(one, one.fallback, traced, places)
+            elif not places and all(x.derivatives is not None for x in kernels_in(traced)):
+                self._differentiate(one, as_passed(without_keys, traced), traced, places)
         except UnsupportedError as error:
             one = error
         return _Lowered(traced, tree, results, places, one)
 
-    def _derivatives(
-        self, kernel: Kernel, traced: ClosedJaxpr, places: Sequence[int] = ()
-    ) -> Derivatives:
-        """Return what differentiates a kernel of this function, or of one of its derivatives."""
-        arguments, results = arguments_of(traced, places), traced.jaxpr.outvars
-        what = "the derivative of "
+    def _differentiate(
+        self,
+        kernel: Kernel,
+        function: Callable[..., list[Array]],
+        traced: ClosedJaxpr,
+        places: Sequence[int],
+    ) -> None:
+        """Give a kernel its derivatives.
+
+        Args:
+          kernel: the kernel.
+          function: what it computes, of what is passed to it.
+          traced: the function as it was traced.
+          places: the places of those of its constants that are arguments of the kernel.
+        """
+
+        def report(error: UnsupportedError) -> None:
+            self._report(error, _DERIVATIVE)
 
         def tell(reason: str) -> None:
-            self._tell(reason, what)
+            self._tell(reason, _DERIVATIVE)
 
-        def make(traced: ClosedJaxpr) -> Kernel:
-            one = whole_kernel_of(traced, (), is_late=True)
-            one.explain, one.derivatives = self._explain, self._derivatives(one, traced)
-            one.on_fallback = tell if self._on_fallback == self._no_back_end else self._on_fallback
-            dtypes[one] = dtypes_of(traced.jaxpr.invars), dtypes_of(traced.jaxpr.outvars)
-            return one
-
-        def is_ready(one: Kernel) -> bool:
-            if one.unsupported:
-                self._report(one.unsupported, what)
-            elif os.environ.get(CHECK) == "1" and not any(map(varying_axes, traced.in_avals)):
-                check(one, *dtypes[one])
-            return one.unsupported is None
-
-        dtypes: dict[Kernel, tuple[list[np.dtype], list[np.dtype]]] = {}
-        return Derivatives(
-            kernel,
-            passed_avals(arguments),
-            passed_avals(results),
-            trace=_trace_inside,
-            make=make,
-            is_ready=functools.cache(is_ready),
+        kernel.derivatives = derivatives_of(
+            function,
+            passed_avals(arguments_of(traced, places)),
+            passed_avals(traced.jaxpr.outvars),
+            explain=self._explain,
+            report=report,
+            on_fallback=tell if self._on_fallback == self._no_back_end else self._on_fallback,
         )
+
+
+def derivatives_of(
+    function: Callable[..., list[Array]],
+    arguments: Sequence[ShapedArray],
+    results: Sequence[ShapedArray],
+    *,
+    explain: Callable[[KernelError], Exception],
+    report: Callable[[UnsupportedError], None],
+    on_fallback: Callable[[str], None],
+) -> Derivatives:
+    """Return what differentiates a kernel, by kernels that are traced when they are needed.
+
+    Args:
+      function: what the kernel computes, which JAX can differentiate; of flat arrays.
+      arguments: those of one instance.
+      results: likewise.
+      explain: returns the exception to raise for a `KernelError`, in the caller's words.
+      report: is called with the reason where a derivative cannot be one kernel.
+      on_fallback: is called with the reason where a platform cannot run kernels.
+    """
+
+    def make(traced: ClosedJaxpr) -> Kernel:
+        one = whole_kernel_of(traced, (), is_late=True)
+        one.explain, one.on_fallback = explain, on_fallback
+        avals = passed_avals(traced.jaxpr.invars), passed_avals(traced.jaxpr.outvars)
+        messages = {"explain": explain, "report": report, "on_fallback": on_fallback}
+        one.derivatives = derivatives_of(one.fallback, *avals, **messages)
+        dtypes[one] = dtypes_of(traced.jaxpr.invars), dtypes_of(traced.jaxpr.outvars)
+        return one
+
+    def is_ready(one: Kernel) -> bool:
+        if one.unsupported:
+            report(one.unsupported)
+        elif os.environ.get(CHECK) == "1" and not any(map(varying_axes, arguments)):
+            check(one, *dtypes[one])
+        return one.unsupported is None
+
+    def trace(function: Callable[..., PyTree], avals: Iterable[ShapedArray]) -> ClosedJaxpr:
+        with inlined():
+            return _trace_inside(function, avals)
+
+    dtypes: dict[Kernel, tuple[list[np.dtype], list[np.dtype]]] = {}
+    return Derivatives(
+        function,
+        arguments,
+        results,
+        trace=trace,
+        make=make,
+        is_ready=functools.cache(is_ready),
+    )
 
 
 def _trace_inside(function: Callable[..., PyTree], avals: Iterable[ShapedArray]) -> ClosedJaxpr:

@@ -24,12 +24,13 @@ Protocol: JAX sees the kernel as a primitive.
 """
 
 import contextlib
+import contextvars
 import dataclasses
 import functools
 import math
 import threading
 import warnings
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import NamedTuple, Protocol
 
 import jax
@@ -82,6 +83,8 @@ class Kernel:
     on_fallback: Callable[[str], None] = warn_of_fallback
     """A function that is called with the reason where the fallback runs although the platform has a
     back end."""
+    inline: Callable[..., list[Array]] | None = None
+    """The same computation again, with derivatives of all kinds; None: `fallback` has them."""
     derivatives: "Differentiable | None" = None
     """What differentiates the kernel; None: it cannot be differentiated."""
     on_batch: Callable[[], None] = lambda: None
@@ -134,13 +137,17 @@ class Kernel:
 
         Returns:
           A function of (carry, consts) that returns the new carry. The leaves of both pytrees are
-          the kernel's arguments and must be float32. The function cannot be differentiated.
+          the kernel's arguments and must be float32.
         """
 
         def step(carry: PyTree, consts: PyTree) -> PyTree:
-            # While JAX traces, `bind` records one equation; `_lowered` below says what it compiles
-            # to.
-            results = _kernel_p.bind(*jax.tree.leaves((carry, consts)), kernel=self)
+            leaves = jax.tree.leaves((carry, consts))
+            if _is_inlined.get():
+                results = (self.inline or self.fallback)(*leaves)
+            else:
+                # While JAX traces, `bind` records one equation; `_lowered` below says what it
+                # compiles to.
+                results = _kernel_p.bind(*leaves, kernel=self)
             return jax.tree.unflatten(jax.tree.structure(carry), results)
 
         return step
@@ -149,7 +156,7 @@ class Kernel:
         """Return a kernel without a table as a JAX function of one instance; `jax.vmap` batches it.
 
         Returns:
-          A function from the kernel's arguments to its results. It cannot be differentiated.
+          A function from the kernel's arguments to its results.
         """
         return lambda leaves: _kernel_p.bind(*leaves, kernel=self)
 
@@ -332,6 +339,19 @@ def make_primitive(
 
 
 _kernel_p = make_primitive("onekernel", "kernel", on_batch=lambda kernel: kernel.on_batch())
+
+
+_is_inlined = contextvars.ContextVar("_is_inlined", default=False)
+
+
+@contextlib.contextmanager
+def inlined() -> Iterator[None]:
+    """In this context, trace what a step computes (`Kernel.inline`) in place of a kernel."""
+    token = _is_inlined.set(True)
+    try:
+        yield
+    finally:
+        _is_inlined.reset(token)
 
 
 def _batch_shape(kernel: Kernel, leaves: Sequence[Array | ShapedArray]) -> tuple[int, ...]:

@@ -21,6 +21,7 @@ This is the only module that needs MuJoCo and MJX: `pip install mujoco-mjx`.
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import io
 import threading
@@ -32,16 +33,20 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.core import ShapedArray
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from onekernel.backends import Kernel, default_backend
-from onekernel.errors import KernelError, UnsupportedError
+from onekernel.errors import UnsupportedError
+from onekernel.fused import derivatives_of
 from onekernel.kernel import is_debugging
 from onekernel.lower import LateProgram, scalarize
 
 # MJX prints two lines where its optional part Warp is not installed.
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
+
+    from onekernel.optimum import SOLUTION, differentiable_solver
 
 __all__ = ["FusedMjx", "MjxState", "fuse_mjx"]
 
@@ -91,7 +96,7 @@ class MjxState:
 class FusedMjx:
     """A `FusedMjx` steps one instance of a model; `fuse_mjx` makes it, and `jax.vmap` batches it.
 
-    The step is lowered when it is first compiled. It cannot be differentiated.
+    The step is lowered when it is first compiled, and so are its derivatives.
     """
 
     def __init__(
@@ -254,6 +259,26 @@ class FusedMjx:
         """Make all physics steps with a loop that XLA compiles."""
         return jax.lax.fori_loop(0, self.n_substeps, lambda _, x: self._substep(x, held), carry)
 
+    def _differentiable_step(self, carry: Fields, held: Fields) -> Fields:
+        """Make all physics steps with a loop that JAX can differentiate.
+
+        Only the state and the acceleration of each physics step are stored for the derivative.
+        """
+
+        # All else is computed again: that takes a kernel less time than to store and load it.
+        @functools.partial(
+            jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(SOLUTION)
+        )
+        def substep(carry: Fields, held: Fields) -> Fields:
+            with differentiable_solver():
+                return self._substep(carry, held)
+
+        if self.n_substeps == 1:
+            return substep(carry, held)
+        return jax.lax.scan(
+            lambda carry, _: (substep(carry, held), None), carry, length=self.n_substeps
+        )[0]
+
     @property
     def _held(self) -> tuple[str, ...]:
         """Return the names of what is given to a step without applied forces, and held."""
@@ -286,24 +311,49 @@ class FusedMjx:
             [x.shape for x in leaves],
             [x.shape for x in jax.tree.leaves(arguments[0])],
         )
+
+        def inline(*leaves: Array) -> list[Array]:
+            carry, held = jax.tree.unflatten(structure, leaves)
+            return jax.tree.leaves(self._differentiable_step(carry, held))
+
         identity = f"mjx.step {hashlib.sha256(content.tobytes()).hexdigest()} {held}"
-        return Kernel(
+        kernel = Kernel(
             program,
             carried=len(arguments[0]),
             steps=self.n_substeps,
             fallback=lambda *leaves: jax.tree.leaves(
                 self._xla_step(*jax.tree.unflatten(structure, leaves))
             ),
-            explain=_explain,
             on_fallback=self._warn_once,
+            inline=inline,
             identity=identity,
         )
+        avals = [ShapedArray(x.shape, x.dtype) for x in leaves]
+        kernel.derivatives = derivatives_of(
+            inline,
+            avals,
+            avals[: len(arguments[0])],
+            explain=kernel.explain,
+            report=self._report_derivative,
+            on_fallback=self._warn_of_derivative,
+        )
+        return kernel
 
-    def _warn_once(self, reason: str) -> None:
-        """Warn that XLA compiles the step, once for each reason."""
-        if self._on_unsupported == "warn" and reason not in self._warned:
-            self._warned.add(reason)
-            warnings.warn(f"XLA compiles mjx.step, which is slower: {reason}", stacklevel=4)
+    def _report_derivative(self, error: UnsupportedError) -> None:
+        """Do what the user wants where a derivative of the step is not one kernel."""
+        if self._on_unsupported == "raise":
+            raise error
+        self._warn_of_derivative(f"one kernel cannot do {error}")
+
+    def _warn_of_derivative(self, reason: str) -> None:
+        self._warn_once(reason, "the derivative of ")
+
+    def _warn_once(self, reason: str, what: str = "") -> None:
+        """Warn that XLA compiles the step, or what of it, once for each reason."""
+        message = f"XLA compiles {what}mjx.step, which is slower: {reason}"
+        if self._on_unsupported == "warn" and message not in self._warned:
+            self._warned.add(message)
+            warnings.warn(message, stacklevel=4)
 
 
 def fuse_mjx(
@@ -336,13 +386,6 @@ def fuse_mjx(
     if on_unsupported not in get_args(OnUnsupported):
         raise ValueError(f"on_unsupported is {on_unsupported!r}, not warn, xla or raise")
     return FusedMjx(mj_model, n_substeps, on_unsupported)
-
-
-def _explain(error: KernelError) -> Exception:
-    """Return the error that is raised for an error of the kernel."""
-    if error.kind == "derivative":
-        return KernelError("a fused step cannot be differentiated: use mjx.step", "derivative")
-    return error
 
 
 def _uncommitted(tree: Any) -> Any:

@@ -8,11 +8,12 @@ import math
 from collections.abc import Callable, Sequence
 from typing import cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Literal, Var, jaxpr_as_fun
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from onekernel.errors import UnsupportedError
 from onekernel.kernel import Kernel, called_by
@@ -60,7 +61,7 @@ def kernel_of(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
         step.program,
         carried=step.carried,
         steps=step.steps,
-        fallback=_fallback(traced, places),
+        fallback=as_passed(_as_function(traced, places), traced, places),
         impl=step.impl,
         explain=step.explain,
         on_fallback=step.on_fallback,
@@ -96,7 +97,7 @@ def whole_kernel_of(traced: ClosedJaxpr, places: Sequence[int], *, is_late: bool
         LateProgram(lower, *shapes) if is_late else lower(),
         carried=0,
         steps=1,
-        fallback=_fallback(traced, places),
+        fallback=as_passed(_as_function(traced, places), traced, places),
         argument_dtypes=_passed_dtypes(arguments),
         result_dtypes=_passed_dtypes(results),
     )
@@ -138,14 +139,27 @@ def dtypes_of(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
     return [np.dtype(cast(ShapedArray, atom.aval).dtype) for atom in atoms]
 
 
-def _fallback(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
-    """Return the same computation in JAX, of what is passed to the kernel."""
+def kernels_in(traced: ClosedJaxpr) -> list[Kernel]:
+    """Return the kernels that a traced function calls."""
+    return [kernel for kernel in map(called_by, traced.jaxpr.eqns) if kernel is not None]
+
+
+def as_passed(
+    function: Callable[..., PyTree], traced: ClosedJaxpr, places: Sequence[int] = ()
+) -> Callable[..., list[Array]]:
+    """Return a function as one from what is passed to its kernel to what that returns.
+
+    Args:
+      function: a function of all arguments of the kernel.
+      traced: that function, or one with the same arguments and results, as it was traced.
+      places: as for `kernel_of`.
+    """
     dtypes, result_dtypes = dtypes_of(arguments_of(traced, places)), dtypes_of(traced.jaxpr.outvars)
-    function = _as_function(traced, places)
 
     def run(*passed: Array) -> list[Array]:
         # A result that is a literal of the jaxpr is a number of Python here.
-        pairs = zip(function(*received(passed, dtypes)), result_dtypes, strict=True)
+        results = jax.tree.leaves(function(*received(passed, dtypes)))
+        pairs = zip(results, result_dtypes, strict=True)
         return [to_pass(jnp.asarray(x, dtype)) for x, dtype in pairs]
 
     return run
