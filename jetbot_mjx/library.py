@@ -16,7 +16,14 @@ from jetbot_mjx import deployment, evaluation, runs, training, tuning, viewers
 from jetbot_mjx.config import Config, Overrides, load_config
 from jetbot_mjx.devices import require_device
 from jetbot_mjx.errors import InvalidError, UserError, check_count, check_size, ran_out
-from jetbot_mjx.runs import claim_run_dir, find_run, find_run_config, seed_folders, trusting
+from jetbot_mjx.runs import (
+    check_resumed,
+    claim_run_dir,
+    find_run,
+    find_run_config,
+    seed_folders,
+    trusting,
+)
 from jetbot_mjx.terminal import restart_clock, show_progress
 
 if TYPE_CHECKING:
@@ -79,12 +86,15 @@ def train(
     elif config is None:
         raise InvalidError('give a configuration, as in train("jetbot"), or a run to resume')
     with _ready(verbose, trust):
+        restart_clock()
         if resume is not None:
             run_dir = find_run(resume)
             config = find_run_config(run_dir)
-        assert config is not None
-        restart_clock()
-        checked = load_config(config, overrides)
+            checked = load_config(config, overrides)
+            check_resumed(run_dir, config, checked)
+        else:
+            assert config is not None
+            checked = load_config(config, overrides)
         with claim_run_dir(run_dir, _name(config)) as folder:
             return training.run(checked, folder, verbose=verbose)
 

@@ -74,6 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with startup.exit_on_interrupt():
         from jetbot_mjx import runs, training
         from jetbot_mjx.training import is_primary
+    if options.resume and run_dir is not None:
+        runs.check_resumed(run_dir, options.config, config)
     startup.divide_cpu(config.cpu_devices)
     if options.distributed:
         training.check_processes(config)

@@ -238,13 +238,24 @@ class Config(Section):
         Raises:
           ConfigError: it differs in settings other than `CHANGEABLE_ON_RESUME`.
         """
+        for key, (then, now) in self.fixed_changes(changed).items():
+            raise ConfigError(
+                f"{clipped(key)} = {shown(now)} is not what the run began with,"
+                f" {shown(then)}: only {', '.join(CHANGEABLE_ON_RESUME)} may change"
+            )
+
+    def fixed_changes(self, changed: "Config") -> dict[str, tuple[Setting, Setting]]:
+        """Return the settings that must not change on resume and do, each before and after.
+
+        Args:
+          changed: the configuration to resume the run with.
+        """
         now, then = changed.flat(), self.flat()
-        for key in {**then, **now}:
-            if then.get(key) != now.get(key) and key not in CHANGEABLE_ON_RESUME:
-                raise ConfigError(
-                    f"{clipped(key)} = {shown(now.get(key))} is not what the run began with,"
-                    f" {shown(then.get(key))}: only {', '.join(CHANGEABLE_ON_RESUME)} may change"
-                )
+        return {
+            key: (then.get(key), now.get(key))
+            for key in {**then, **now}
+            if then.get(key) != now.get(key) and key not in CHANGEABLE_ON_RESUME
+        }
 
     def check_cpu_devices(self, local_device_count: int) -> None:
         """Raise an error if JAX has divided the CPU otherwise.

@@ -1,3 +1,4 @@
+from .bootstrap_intervals import FEW_SEEDS as FEW_SEEDS
 from .bootstrap_intervals import bootstrap as bootstrap
 from .clips import Clip as Clip
 from .comparison import Comparison as Comparison

@@ -14,6 +14,10 @@ from jaxtyping import Float
 Statistic = Callable[..., Float[np.ndarray, "*n"] | np.floating]
 """A function of one or several samples, and of the axis of the seeds."""
 
+FEW_SEEDS = 5
+"""Of fewer seeds an interval is told with the caveat that it is too narrow: over four it holds the
+true value in 80 of 100 cases, over two in 50."""
+
 _RESAMPLES = 9999
 _SEED = 20_253
 _TRIMMED = 0.25

@@ -8,7 +8,7 @@ that comparison holds only for these policies, not for other trainings.
 """
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
@@ -19,11 +19,12 @@ from jaxtyping import Bool, Float
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError, shown
 from jetbot_mjx.evaluation import bootstrap_intervals as intervals
-from jetbot_mjx.evaluation.bootstrap_intervals import Estimate, bootstrap
+from jetbot_mjx.evaluation.bootstrap_intervals import FEW_SEEDS, Estimate, bootstrap
 from jetbot_mjx.evaluation.curves import CurvePoint, band
 from jetbot_mjx.evaluation.evaluator import Summary, json_values
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.report import Report
+from jetbot_mjx.evaluation.result_names import path_from
 from jetbot_mjx.runs import JsonObject, shortened
 
 
@@ -133,12 +134,14 @@ def comparison_json(values: JsonObject, *of_each_seed: str) -> JsonObject:
       values: the fields of the comparison.
       of_each_seed: the fields of each seed's report to keep.
     """
+    folder = values["folder"]
     runs = [
         {
             **run._asdict(),
             "seeds": [
                 {
                     "name": name,
+                    "run": path_from(folder, report.checkpoint.parents[1]),
                     "checkpoint": report.checkpoint.name,
                     "env_steps": report.env_steps,
                     **{field: getattr(report, field) for field in of_each_seed},
@@ -172,6 +175,37 @@ def common_fields(
         "baselines": firsts[0].baselines,
         "versions": firsts[0].versions,
     }
+
+
+def told_step_cost(comparison: Comparison) -> str:
+    """Return what a step costs in the runs of a comparison, as a sentence without its full stop.
+
+    Returns:
+      The sentence, which names the runs where they differ; empty if no step costs anything.
+    """
+    costs = {
+        run.name: next(iter(run.seeds.values())).config.task.step_cost for run in comparison.runs
+    }
+    if not any(costs.values()):
+        return ""
+    if len(set(costs.values())) == 1:
+        return f"each step costs {max(costs.values()):g} m of the return"
+    told = ", ".join(f"{cost:g} m in {name}" for name, cost in costs.items())
+    return f"each step costs {told}, so the returns are not told beside each other"
+
+
+def few_seeds_line(results: Iterable[Aggregate]) -> str:
+    """Return a line about intervals over so few seeds that they mislead; empty without one.
+
+    Args:
+      results: one quantity of each run.
+    """
+    if not any(one.over == "seeds" and one.count < FEW_SEEDS for one in results):
+        return ""
+    return (
+        "intervals over few seeds are too narrow: over two they hold the true value about every"
+        " second time, and over equal seeds they have no width\n"
+    )
 
 
 def check_comparable(configs: Mapping[str, Config]) -> None:

@@ -12,7 +12,7 @@ from jetbot_mjx.evaluation.curves import ReturnPoint, read_curve
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
 from jetbot_mjx.evaluation.html_report import write_comparison, write_return_report
-from jetbot_mjx.evaluation.result_names import name_with_count
+from jetbot_mjx.evaluation.result_names import comparison_folder, name_with_count
 from jetbot_mjx.evaluation.return_report import (
     ReturnComparison,
     ReturnReport,
@@ -73,7 +73,7 @@ def compare_return_runs(
     firsts = {name: next(iter(seeds.values())) for name, seeds in entries.items()}
     check_one_environment({name: one.config for name, one in firsts.items()})
     name = name_with_count("comparison", episodes, REPORT_GOALS, "-episodes")
-    folder = Path(output or folder / _FOLDER / name)
+    folder = Path(output or comparison_folder(folder / _FOLDER, name, entries))
     reporter = _Reporter(episodes)
 
     def place_of(checkpoint: Checkpoint) -> Path:

@@ -24,7 +24,12 @@ from jetbot_mjx.evaluation.report import (
     compare_times,
     find_failures,
 )
-from jetbot_mjx.evaluation.result_names import find_report, name_with_count, report_folder
+from jetbot_mjx.evaluation.result_names import (
+    comparison_folder,
+    find_report,
+    name_with_count,
+    report_folder,
+)
 from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
 from jetbot_mjx.evaluation.robustness import SWEEP_GOALS, MujocoEvaluator, MujocoResult, Sweeper
 from jetbot_mjx.runs import Checkpoint, JsonObject, Setup, Which, check_writable, load_checkpoint
@@ -47,7 +52,7 @@ class ReportOptions(TypedDict, total=False):
     """Folder to write; None: of a report the one in `evaluations/` of the run folder that
     `report_folder` chooses, so that no fuller report is replaced; of a comparison
     `evaluations/comparison/` of the first run, whose name ends with the number of goals if they are
-    not as many as by default."""
+    not as many as by default, and with a number if one of other runs lies there."""
     robustness: bool
     """Whether to evaluate also on robots that differ from the preset, and in C MuJoCo."""
     ranges: str | Path | None
@@ -161,7 +166,7 @@ def compare_runs(
             return compare_return_runs(seeds, first, reporter.episodes, reporter.output)
     check_comparable({name: entry.first.config for name, entry in entries.items()})
     name = name_with_count("comparison", reporter.episodes, REPORT_GOALS, "-goals")
-    folder = Path(reporter.output or first / _FOLDER / name)
+    folder = Path(reporter.output or comparison_folder(first / _FOLDER, name, seeds))
 
     def write(checkpoint: Checkpoint, setup: Setup) -> Report:
         report = reporter.write(checkpoint, setup, again=False)

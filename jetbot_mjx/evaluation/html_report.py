@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from jetbot_mjx.evaluation import learning_curves, plots, return_plots
-from jetbot_mjx.evaluation.comparison import Comparison
+from jetbot_mjx.evaluation.comparison import Comparison, told_step_cost
 from jetbot_mjx.evaluation.moments import plot_moments, shown_goals
 from jetbot_mjx.evaluation.report import Report, replay_command
 from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
@@ -119,9 +119,12 @@ def write_comparison(comparison: Comparison | ReturnComparison) -> Path:
         [os.path.relpath(one.folder / "report", comparison.folder) for one in run.seeds.values()]
         for run in comparison.runs
     ]
-    template = "comparison" if isinstance(comparison, Comparison) else "return_comparison"
-    values = comparison.to_json()
-    return _write(comparison.folder, "comparison", values, figures, {"links": links}, template)
+    template, more = "return_comparison", JsonObject(links=links)
+    if isinstance(comparison, Comparison):
+        template = "comparison"
+        cost = told_step_cost(comparison)
+        more["step_cost"] = f"{cost[0].upper()}{cost[1:]}." if cost else ""
+    return _write(comparison.folder, "comparison", comparison.to_json(), figures, more, template)
 
 
 def write_return_report(report: ReturnReport) -> Path:

@@ -1,10 +1,14 @@
 """Choose where results are written, so that a quick look does not replace a fuller result."""
 
+import itertools
 import json
+import os
+import re
+from collections.abc import Mapping
 from pathlib import Path
 
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
-from jetbot_mjx.runs import read_text
+from jetbot_mjx.runs import Checkpoint, read_text
 
 PARTS = ("robustness", "randomized", "mujoco", "rendered")
 """Parts of a report that are written on request or if the run has ranges; keys of its JSON file,
@@ -80,6 +84,60 @@ def fuller_report(folder: Path, name: str) -> Path | None:
     """Return the folder that a report of the checkpoint `name` was written beside, if it exists."""
     other = folder.with_name(name)
     return other if folder != other and _goals_and_parts(other) is not None else None
+
+
+def comparison_folder(
+    evaluations: Path, name: str, runs: Mapping[str, Mapping[str, Checkpoint]]
+) -> Path:
+    """Choose the folder of a new comparison, in which none of other runs lies.
+
+    The folder is `<name>`, or the first of `<name>-2`, `<name>-3` and so on that is free or holds
+    a comparison of the same runs, which the new one replaces.
+
+    Args:
+      evaluations: the folder of all reports of the first run.
+      name: the name of the comparison.
+      runs: the policy of each seed by name, of each run by name.
+
+    Returns:
+      The folder, which may not exist yet.
+    """
+    for number in itertools.count(1):
+        folder = evaluations / (name if number == 1 else f"{name}-{number}")
+        wanted = [
+            [run, *(path_from(folder, one.run_dir) for one in seeds.values())]
+            for run, seeds in runs.items()
+        ]
+        if _compared_runs(folder) in (None, wanted):
+            break
+    return folder
+
+
+def path_from(folder: Path, path: Path) -> str:
+    """Return the path that leads from a folder to another one, on every system with slashes."""
+    return Path(os.path.relpath(path, folder)).as_posix()
+
+
+def kept_line(folder: Path) -> str:
+    """Return what follows the page of a comparison that was written beside one of other runs.
+
+    Args:
+      folder: the folder of the new comparison.
+    """
+    numbered = re.fullmatch(r"(comparison(?:-\d+-[a-z]+)?)-\d+", folder.name)
+    if not numbered or (kept := _compared_runs(other := folder.with_name(numbered[1]))) is None:
+        return ""
+    return f" (the one of {', '.join(name for name, *_ in kept)} in {other} stays as it is)"
+
+
+def _compared_runs(folder: Path) -> list[list[str]] | None:
+    """Return the runs of the comparison in a folder; None without one."""
+    try:
+        values = json.loads(read_text(folder / "comparison.json"))
+        return [[run["name"], *(seed["run"] for seed in run["seeds"])] for run in values["runs"]]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        # Whatever cannot be read is not worth keeping.
+        return None
 
 
 def _goals_and_parts(folder: Path) -> tuple[int, frozenset[str]] | None:

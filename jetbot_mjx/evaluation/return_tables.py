@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+from jetbot_mjx.evaluation.comparison import few_seeds_line
+from jetbot_mjx.evaluation.result_names import kept_line
 from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
 from jetbot_mjx.evaluation.returns import ReturnSummary
 from jetbot_mjx.terminal import text_table
@@ -38,14 +40,15 @@ def summarize_return_comparison(comparison: ReturnComparison) -> str:
     lines = [
         f"{comparison.episodes:,} fixed starts, {len(policies)} policies",
         _policies_table({**policies, **comparison.baselines}),
-        f"\n{text_table(rows)}\n",
+        f"\n{text_table(rows)}\n{few_seeds_line(run.episode_return for run in runs)}",
     ]
     lines += [
         f"{pair.a} against {pair.b}: {pair.episode_return.told('{:+z.2f}', 'starts')}"
         for pair in comparison.pairs
     ]
     lines += comparison.other_code
-    return "\n".join([*lines, f"report: {comparison.folder / 'comparison.html'}"])
+    page = comparison.folder / "comparison.html"
+    return "\n".join([*lines, f"report: {page}{kept_line(comparison.folder)}"])
 
 
 def _policies_table(policies: Mapping[str, ReturnSummary]) -> str:

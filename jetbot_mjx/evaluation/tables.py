@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation.comparison import Comparison
+from jetbot_mjx.evaluation.comparison import Comparison, few_seeds_line, told_step_cost
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.report import Report
-from jetbot_mjx.evaluation.result_names import fuller_report
+from jetbot_mjx.evaluation.result_names import fuller_report, kept_line
 from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
 from jetbot_mjx.evaluation.return_tables import (
     summarize_return_comparison,
@@ -52,11 +52,15 @@ def summarize_comparison(comparison: Comparison | ReturnComparison) -> str:
     }
     text = (
         f"{_count(comparison.episodes, 'fixed goal')} (set {GOAL_SET_VERSION}),"
-        f" {len(policies)} policies\n{policies_table(policies)}\n\n{runs_table(comparison)}"
+        f" {len(policies)} policies\n{policies_table(policies)}\n"
     )
+    if cost := told_step_cost(comparison):
+        text += f"{cost}\n"
+    caveat = few_seeds_line(run.success_rate for run in runs)
+    text += f"\n{runs_table(comparison)}\n{caveat}"
     if comparison.pairs:
-        text += f"\n\n{pairs_table(comparison)}"
-    return f"{text}\nreport: {comparison.folder / 'comparison.html'}"
+        text += f"\n{pairs_table(comparison)}\n"
+    return f"{text}report: {comparison.folder / 'comparison.html'}{kept_line(comparison.folder)}"
 
 
 def below_target(

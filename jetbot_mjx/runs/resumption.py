@@ -5,6 +5,8 @@ A checkpoint of the resumable trainer holds two trees: the policy, and `training
 written, or if it was written under another configuration.
 """
 
+import json
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,10 +17,11 @@ from jaxtyping import PyTree
 
 from jetbot_mjx.agents import TALLIED, PolicyParams, TrainState
 from jetbot_mjx.config import Config, ConfigError, parse_config
+from jetbot_mjx.errors import clipped
 from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint import POLICY, explanation
 from jetbot_mjx.runs.checkpoint_store import CheckpointError, checkpoint_path
-from jetbot_mjx.runs.run_dir import JsonObject
+from jetbot_mjx.runs.run_dir import CONFIG, JsonObject, seed_dirs
 
 TRAINING = "training"
 """Name of the tree that holds the part of the state that acting does not need."""
@@ -41,6 +44,48 @@ def to_trees(state: TrainState) -> dict[str, PyTree]:
     """Return a training state as the trees of a checkpoint, with its sums by name."""
     rest = {name: getattr(state, name) for name in _REST}
     return {POLICY: state.policy_params, TRAINING: {**rest, "tally": state.sums}}
+
+
+def check_resumed(run_dir: Path, stored: Config, config: Config) -> None:
+    """Raise an error if a run that has trained is to be continued with settings that are fixed.
+
+    A run that ended before its first checkpoint may start again with others.
+
+    Args:
+      run_dir: the run folder.
+      stored: its configuration.
+      config: the configuration to continue it with.
+
+    Raises:
+      ConfigError: a setting changed that must not. The message names it, and the command of another
+        run that begins with the policy.
+    """
+    if stored.seeds == config.seeds and not trained_steps(run_dir, stored):
+        return
+    changes = stored.fixed_changes(config)
+    # The command names another policy to begin with.
+    settings = [
+        f"--set={key}={json.dumps(now)}" for key, (_, now) in changes.items() if key != "init_from"
+    ]
+    command = ["jetbot-mjx", "train", str(run_dir / CONFIG), "--init-from", str(run_dir), *settings]
+    try:
+        stored.check_resume(config)
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error}: leave {clipped(', '.join(changes))} out, or begin another run with this"
+            f" one's policy: `{shlex.join([*command, '--run-dir', 'NEW'])}`"
+        ) from None
+
+
+def trained_steps(run_dir: Path, stored: Config) -> list[int]:
+    """Return the last environment step of every seed of a run that has a checkpoint.
+
+    Args:
+      run_dir: the run folder.
+      stored: its configuration.
+    """
+    found = [checkpoint_store.checkpoint_steps(each) for each in seed_dirs(run_dir, stored)]
+    return [steps[-1] for steps in found if steps]
 
 
 def resume(

@@ -18,9 +18,10 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from jetbot_mjx.config import (
     FOLDER,
@@ -48,6 +49,13 @@ CONFIG = "config.yaml"
 """Name of the file in a run folder that holds the resolved configuration."""
 
 _VERSIONS = "versions.json"
+
+_LOCK = ".lock"
+"""Name of the file that a training locks, with the number of its process."""
+
+_LOCK_TRIES, _LOCK_PAUSE = 4, 0.025
+"""How often a locked file is tried again, and after which time [s]: `is_occupied` holds it for an
+instant."""
 
 _MOST_BYTES = 100_000_000
 """Largest size of a file that is read from a run, but for a checkpoint's arrays."""
@@ -219,6 +227,42 @@ def stored_config(run_dir: Path) -> Config | None:
     raise UserError(f"--run-dir {run_dir} exists and holds no run (no {CONFIG}): name a new folder")
 
 
+def is_occupied(run_dir: Path) -> bool:
+    """Return whether a living process trains in a run folder, as far as this system can tell.
+
+    Nothing is written. Of a folder that cannot be read, or where there are no locks, nothing is
+    known: False.
+    """
+    if fcntl is None:
+        return False
+    try:
+        with open(run_dir / _LOCK, "rb", opener=open_at_once) as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _lock(file: IO[str]) -> None:
+    """Lock a file for this process alone, and wait a moment for one who only asks about it.
+
+    Raises:
+      BlockingIOError: another process holds it.
+      OSError: the file system has no locks.
+    """
+    assert fcntl is not None
+    for tries_left in reversed(range(_LOCK_TRIES)):
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if not tries_left:
+                raise
+            time.sleep(_LOCK_PAUSE)
+
+
 @contextlib.contextmanager
 def occupied(run_dir: Path) -> Iterator[None]:
     """Create a run folder if needed, and lock it against every other training.
@@ -229,7 +273,7 @@ def occupied(run_dir: Path) -> Iterator[None]:
     Raises:
       UserError: the folder cannot be written, or another training has locked it.
     """
-    path = run_dir / ".lock"
+    path = run_dir / _LOCK
     try:
         make_folders(run_dir)
         file = path.open("a+")
@@ -242,7 +286,7 @@ def occupied(run_dir: Path) -> Iterator[None]:
                 line = "this system has no locks: start no second training in this run folder"
                 print(line, file=sys.stderr, flush=True)
             else:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _lock(file)
         except BlockingIOError:
             file.seek(0)
             raise UserError(

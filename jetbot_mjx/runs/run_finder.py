@@ -13,7 +13,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from jetbot_mjx.config import Config, run_around
 from jetbot_mjx.errors import (
@@ -31,6 +31,7 @@ from jetbot_mjx.runs.run_dir import (
     DamagedRunError,
     JsonObject,
     atomic_folder,
+    is_occupied,
     read_config,
     shortened,
 )
@@ -52,6 +53,19 @@ Unusable = DamagedRunError | UnreadableError
 """Why a list has no line of a run."""
 
 
+State = Literal["running", "complete", "reached", "stopped"]
+"""What a run is doing: a living process trains it; it made all its steps; it ended before, because
+it reached `stop_at_success` or `stop_at_return`; or it was stopped, whoever did that."""
+
+_MARKS: dict[State, str] = {"running": " running", "complete": "", "reached": " +", "stopped": " *"}
+"""What follows the steps of a run in a list."""
+
+_FOOTNOTES: dict[State, str] = {
+    "reached": "+ reached stop_at_success or stop_at_return before its last step",
+    "stopped": "* stopped before its last step: train --resume RUN continues it",
+}
+
+
 class RunInfo(NamedTuple):
     """A `RunInfo` holds what a list of runs says about one of them."""
 
@@ -70,6 +84,8 @@ class RunInfo(NamedTuple):
     """Mean return of the best evaluation in an `environment`, likewise; None for a robot."""
     changed: float
     """Time of the last line of its log [s since 1970]."""
+    state: State
+    """Whether it is being trained, and otherwise why its training ended."""
 
     @property
     def name(self) -> str:
@@ -198,7 +214,29 @@ def read_info(run_dir: Path) -> RunInfo:
         success_rate=_mean_best(histories, "eval/success_rate", 0.0, 1.0),
         episode_return=_mean_best(histories, "eval/episode_return") if own else None,
         changed=changed,
+        state=_state(run_dir, config, histories),
     )
+
+
+def _state(run_dir: Path, config: Config, histories: Sequence[Sequence[History]]) -> State:
+    if is_occupied(run_dir):
+        return "running"
+    if all(lines and lines[-1].env_steps >= config.ppo.num_timesteps for lines in histories):
+        return "complete"
+    targets = {
+        "eval/success_rate": config.stop_at_success,
+        "eval/episode_return": config.stop_at_return,
+    }
+    reached = all(
+        lines
+        and any(
+            target is not None and value is not None and value >= target
+            for metric, target in targets.items()
+            for value in [lines[-1].metrics.get(metric)]
+        )
+        for lines in histories
+    )
+    return "reached" if reached else "stopped"
 
 
 def _mean_best(
@@ -231,7 +269,7 @@ def runs_table(runs: Sequence[RunInfo], damaged: Sequence[Unusable] = ()) -> str
         (
             run.name,
             run.task,
-            f"{run.env_steps:,}" + (" *" if run.env_steps < run.num_timesteps else ""),
+            f"{run.env_steps:,}{_MARKS[run.state]}",
             format_score(run),
             _age(time.time() - run.changed),
         )
@@ -240,8 +278,8 @@ def runs_table(runs: Sequence[RunInfo], damaged: Sequence[Unusable] = ()) -> str
     lines = [text_table(rows, left=2)]
     if not runs:
         lines = ["no runs here: train one, or use one that comes with the package: pretrained:NAME"]
-    if any(run.env_steps < run.num_timesteps for run in runs):
-        lines.append("* stopped before its last step, or reached stop_at_success or stop_at_return")
+    found = {run.state for run in runs}
+    lines += [line for state, line in _FOOTNOTES.items() if state in found]
     return "\n".join([*lines, *(printable(_why_not(one)) for one in damaged)])
 
 

@@ -32,6 +32,8 @@ class Result(NamedTuple):
     """Time spent on the training, in all processes [s]."""
     next_commands: Sequence[str] = ("evaluate", "render", "play")
     """Commands for its policies, the first of which takes several seeds."""
+    ended_early: str = ""
+    """Which target ended it before its last step, as a line; empty if none did."""
 
     def __repr__(self) -> str:
         """Return the folder and the best evaluation of each seed in one line."""
@@ -78,17 +80,9 @@ def summary(result: Result) -> str:
             f" {standing.best_steps:,} steps; last parameters: sha256 {fingerprint}"
         )
     if len(lines) > 1:
-        # Its statistics take half a second to import.
-        from jetbot_mjx.evaluation import bootstrap
-
-        best = [standing.best for standing in result.standings if standing.best]
-        form = "{:.2%}" if best[0].success_rate is not None else "{:.1f}"
-        over_seeds = bootstrap(np.mean, [one.score for one in best])
-        value, low, high = map(form.format, (over_seeds.value, over_seeds.low, over_seeds.high))
-        what = "success" if best[0].success_rate is not None else "return"
-        lines.append(
-            f"{len(lines)} seeds: {value} {what} in the mean (95 % interval {low} .. {high})"
-        )
+        lines.append(_told_mean([one.best for one in result.standings if one.best]))
+    if result.ended_early:
+        lines.append(result.ended_early)
     first = shlex.quote(str(result.run_dirs[0]))
     lines += [
         f"total {result.wall_seconds:.1f} s",
@@ -108,6 +102,25 @@ def _told_score(best: Summary | ReturnSummary) -> str:
     return f"{best.success_rate:.1%} success"
 
 
+def _told_mean(best: Sequence[Summary | ReturnSummary]) -> str:
+    """Return the line about the mean of all seeds, with its interval if that says something."""
+    # Its statistics take half a second to import.
+    from jetbot_mjx.evaluation import FEW_SEEDS, bootstrap
+
+    form, what = "{:.2%}", "success"
+    if best[0].success_rate is None:
+        form, what = "{:.1f}", "return"
+    scores = [one.score for one in best]
+    text = f"{len(best)} seeds: {form.format(np.mean(scores))} {what} in the mean"
+    # Two seeds miss the true value every second time, and equal ones leave no width.
+    if len(best) < 3 or min(scores) == max(scores):
+        return text
+    interval = bootstrap(np.mean, scores)
+    narrow = ", too narrow for so few seeds" if len(best) < FEW_SEEDS else ""
+    low, high = form.format(interval.low), form.format(interval.high)
+    return f"{text} (95 % interval {low} .. {high}{narrow})"
+
+
 def stop_message(run_dir: Path, run_dirs: Sequence[Path]) -> str:
     """Return the line about a training that was stopped, and the folder of each of its seeds."""
     if not all(map(checkpoint_steps, run_dirs)):
@@ -118,8 +131,22 @@ def stop_message(run_dir: Path, run_dirs: Sequence[Path]) -> str:
 def complete_message(config: Config, standings: Sequence[Standing]) -> str:
     """Return the line about a run that has nothing left to train, and how to train it further."""
     steps = min(standing.env_steps for standing in standings)
-    planned = config.ppo.all_steps
     setting = "ppo.num_timesteps"
-    if steps < planned:
+    if steps < config.ppo.all_steps:
         setting = "stop_at_success" if config.stop_at_return is None else "stop_at_return"
     return f"complete after {steps:,} steps; raise {setting} to train further"
+
+
+def target_message(config: Config, standings: Sequence[Standing]) -> str:
+    """Return the line about the target that ended a complete training; empty if it made all steps.
+
+    Args:
+      config: the configuration of the run.
+      standings: the progress of each seed of a run that is complete.
+    """
+    steps = min(standing.env_steps for standing in standings)
+    if steps >= config.ppo.all_steps:
+        return ""
+    targets = {"stop_at_success": config.stop_at_success, "stop_at_return": config.stop_at_return}
+    told = [f"{key} = {value:g}" for key, value in targets.items() if value is not None]
+    return f"{' or '.join(told)} reached at {steps:,} steps"

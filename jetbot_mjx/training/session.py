@@ -38,7 +38,7 @@ from jetbot_mjx.training.composition import Training, compose
 from jetbot_mjx.training.console import SilentTerminal
 from jetbot_mjx.training.memory import MemoryModel, device_memory, sizes
 from jetbot_mjx.training.preemption import DeferredSignals, StopRequest
-from jetbot_mjx.training.result import Result, complete_message, stop_message
+from jetbot_mjx.training.result import Result, complete_message, stop_message, target_message
 from jetbot_mjx.training.run_recorder import RunRecorder, SeedRecorder, Standing, open_sinks
 from jetbot_mjx.training.terminal import open_terminal
 from onekernel import ProgramCache
@@ -304,9 +304,7 @@ def _check_folder(training: Training) -> bool:
         )
     # A run that ended before its first checkpoint, for example because memory was too small, may
     # start again with another configuration.
-    trained = [
-        steps for each in runs.seed_dirs(run_dir, stored) if (steps := checkpoint_steps(each))
-    ]
+    trained = runs.trained_steps(run_dir, stored)
     if stored.seeds != config.seeds or trained:
         try:
             stored.check_resume(config)
@@ -315,7 +313,7 @@ def _check_folder(training: Training) -> bool:
                 f"{run_dir} holds another run: choose a new --run-dir, or begin with its policy,"
                 f" --init-from {run_dir}: {error}"
             ) from None
-    done = max((steps[-1] for steps in trained), default=0)
+    done = max(trained, default=0)
     planned = config.ppo.all_steps
     if planned < done and config.ppo.num_timesteps != stored.ppo.num_timesteps:
         raise ConfigError(
@@ -363,6 +361,8 @@ def _result(training: Training, recorder: RunRecorder | None, *, finished: bool)
         return Result(*folders, [], [], finished, 0.0)
     fingerprints = [seed.fingerprint for seed in recorder.seeds]
     done = Result(*folders, recorder.standings, fingerprints, finished, recorder.wall_seconds)
+    if recorder.complete:
+        done = done._replace(ended_early=target_message(training.config, recorder.standings))
     env = training.setup.env
     if not isinstance(env, AdaptedEnv):
         return done

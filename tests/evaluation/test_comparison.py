@@ -12,7 +12,12 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.comparison import check_comparable
 from jetbot_mjx.evaluation.curves import CurvePoint
 from jetbot_mjx.evaluation.evaluator import wilson_interval
-from jetbot_mjx.evaluation.tables import pairs_table, policies_table, runs_table
+from jetbot_mjx.evaluation.tables import (
+    pairs_table,
+    policies_table,
+    runs_table,
+    summarize_comparison,
+)
 
 
 def test_several_seeds_are_evaluated_over_seeds():
@@ -31,6 +36,13 @@ def test_one_seed_is_evaluated_over_its_episodes():
     assert run.success_rate.mean[1:] == wilson_interval(9, 10)
     assert run.time_to_goal.mean.value == pytest.approx(0.4)
     assert run.time_to_goal.mean.low < 0.4 < run.time_to_goal.mean.high
+
+
+@pytest.mark.parametrize(("counts", "told"), [((1, 1), 0), ((5, 1), 0), ((4, 5), 1), ((2, 1), 1)])
+def test_intervals_over_few_seeds_are_told_with_a_caveat(counts, told):
+    seeds = [[report_of(wins(8))] * count for count in counts]
+    said = summarize_comparison(comparison_of(**dict(zip("ab", seeds, strict=True))))
+    assert said.count("over equal seeds they have no width\n") == told
 
 
 def test_seeds_without_a_success_have_no_time_and_say_so():
@@ -170,4 +182,5 @@ def test_a_comparison_is_json_and_text():
     assert "2 seeds" in text
     assert "10 episodes" in text
     assert "a against b" in pairs_table(comparison)
+    assert "intervals over few seeds are too narrow: over two" in summarize_comparison(comparison)
     assert "-" in policies_table({"b": comparison.runs[1].seeds["seed-0"]}).splitlines()[1]

@@ -125,6 +125,25 @@ def test_a_comparison_tells_that_the_code_is_not_the_same(folder, tmp_path, monk
 
 
 @pytest.mark.usefixtures("blank_figures")
+def test_a_comparison_of_other_runs_is_kept_and_one_of_the_same_replaced(folder, capsys):
+    one, two = folder / "one", folder / "two"
+    for others, name in (
+        ([two / "seed-2"], "comparison-2-episodes"),
+        ([two / "seed-3"], "comparison-2-episodes-2"),
+        ([two / "seed-2"], "comparison-2-episodes"),
+        ([two], "comparison-2-episodes-3"),
+    ):
+        found = compare_runs([one, *others], episodes=2)
+        assert found.folder == one / "evaluations" / name
+    said = evaluate.main([str(one), str(two), "--episodes", "2"])
+    assert said == 0
+    first = one / "evaluations" / "comparison-2-episodes"
+    assert capsys.readouterr().out.splitlines()[-1] == (
+        f"report: {first}-3/comparison.html (the one of one, seed-2 in {first} stays as it is)"
+    )
+
+
+@pytest.mark.usefixtures("blank_figures")
 def test_from_python_the_same_numbers_come(folder, compared, tmp_path):
     report = library.evaluate(folder / "one", episodes=EPISODES, output=tmp_path)
     values = read(tmp_path / "report.json")

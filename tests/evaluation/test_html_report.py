@@ -209,8 +209,7 @@ def test_one_goal_in_the_terminal(tmp_path):
 def test_a_cost_of_steps_is_told_beside_the_return(tmp_path):
     report = report_of(tmp_path, np.ones(2))
     assert "costs" not in summarize_report(report)
-    task = report.config.task.model_copy(update={"step_cost": 0.02})
-    costly = report._replace(config=report.config.model_copy(update={"task": task}))
+    costly = costing(report, 0.02)
     assert "\neach step costs 0.02 m of the return\n" in summarize_report(costly)
     with unpainted():
         page = write_report(costly)
@@ -218,11 +217,47 @@ def test_a_cost_of_steps_is_told_beside_the_return(tmp_path):
     assert "Each step costs 0.02 m of the return." in page.with_suffix(".md").read_text("utf-8")
 
 
+def costing(report, cost):
+    """A report whose task costs so much in each step [m]."""
+    task = report.config.task.model_copy(update={"step_cost": cost})
+    return report._replace(config=report.config.model_copy(update={"task": task}))
+
+
+@pytest.mark.parametrize(
+    ("costs", "said"),
+    [
+        ((0.0, 0.0), ""),
+        ((0.02, 0.02), "each step costs 0.02 m of the return"),
+        (
+            (0.0, 0.02),
+            "each step costs 0 m in a, 0.02 m in b, so the returns are not told beside each other",
+        ),
+    ],
+)
+def test_a_comparison_tells_what_a_step_costs(tmp_path, costs, said):
+    runs = {
+        name: {"seed-0": costing(report_of(tmp_path, np.ones(2), name), cost)}
+        for name, cost in zip("ab", costs, strict=True)
+    }
+    comparison = compare(tmp_path / "comparison", runs)
+    with unpainted():
+        page = write_comparison(comparison)
+    terminal, html, text = (
+        summarize_comparison(comparison),
+        page.read_text("utf-8"),
+        page.with_suffix(".md").read_text("utf-8"),
+    )
+    if not said:
+        assert not any("step costs" in one for one in (terminal, html, text))
+        return
+    assert f"\n{said}\n\n" in terminal
+    assert f"Intervals here are over episodes. E{said[1:]}." in html
+    assert f"\n\nE{said[1:]}.\n" in text
+
+
 def test_returns_of_other_costs_are_not_told_beside_each_other(tmp_path):
     cheap = report_of(tmp_path, np.ones(2), "cheap")
-    task = cheap.config.task.model_copy(update={"step_cost": 0.02})
-    costly = report_of(tmp_path, np.ones(2), "costly")
-    costly = costly._replace(config=cheap.config.model_copy(update={"task": task}))
+    costly = costing(report_of(tmp_path, np.ones(2), "costly"), 0.02)
     told = f"{cheap.policy.episode_return:+.3f} m"
     for other, is_told in ((report_of(tmp_path, np.ones(2), "other"), True), (costly, False)):
         runs = {"a": {"seed-0": cheap}, "b": {"seed-0": other}}

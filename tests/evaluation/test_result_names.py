@@ -2,6 +2,7 @@
 
 import errno
 import json
+import types
 
 import pytest
 
@@ -9,9 +10,12 @@ from jetbot_mjx.errors import UnreadableError
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
 from jetbot_mjx.evaluation.result_names import (
     PARTS,
+    comparison_folder,
     find_report,
     fuller_report,
+    kept_line,
     name_with_count,
+    path_from,
     report_folder,
 )
 from jetbot_mjx.runs import run_dir
@@ -130,3 +134,50 @@ def test_a_report_on_a_drive_that_does_not_answer_is_not_replaced(tmp_path, monk
     monkeypatch.setattr(run_dir, "open_at_once", no_answer)
     with pytest.raises(UnreadableError, match="cannot be read now"):
         report_folder(tmp_path, STEPS, REPORT_GOALS, NONE)
+
+
+def compared(folder, runs):
+    """Write a comparison of runs, each with the folders of its seeds, below another folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    values = [
+        {"name": name, "seeds": [{"run": path_from(folder, seed)} for seed in seeds]}
+        for name, seeds in runs.items()
+    ]
+    (folder / "comparison.json").write_text(json.dumps({"runs": values}))
+
+
+def test_a_comparison_of_other_runs_has_a_folder_of_its_own(tmp_path):
+    def place(runs):
+        policies = {
+            name: {seed.name: types.SimpleNamespace(run_dir=seed) for seed in seeds}
+            for name, seeds in runs.items()
+        }
+        return comparison_folder(tmp_path / "a" / "evaluations", "comparison", policies)
+
+    a, b, c, other = (tmp_path / name for name in ("a", "b", "c", "x/b"))
+    sets = [
+        {"a": [a], "b": [b]},
+        {"a": [a], "c": [c]},
+        # Of the same names, in another folder, and with another checkpoint.
+        {"a": [a], "b": [other]},
+        {"a": [a], "b @ 100": [b]},
+        {"a": [a], "b": [b / "seed-0", b / "seed-1"]},
+    ]
+    for number, runs in enumerate(sets, start=1):
+        name = "comparison" if number == 1 else f"comparison-{number}"
+        assert place(runs) == tmp_path / "a" / "evaluations" / name
+        compared(place(runs), runs)
+    assert [place(runs).name.rpartition("-")[2] for runs in sets] == ["comparison", *"2345"]
+    # One that cannot be read is replaced.
+    (tmp_path / "a" / "evaluations" / "comparison-2" / "comparison.json").write_text("{")
+    assert place({"d": [tmp_path / "d"]}).name == "comparison-2"
+
+
+def test_the_comparison_that_is_kept_is_named(tmp_path):
+    first = tmp_path / "comparison-16-goals"
+    assert kept_line(tmp_path / "comparison-16-goals-2") == ""
+    compared(first, {"a": [tmp_path], "b": [tmp_path]})
+    assert kept_line(first) == ""
+    told = f" (the one of a, b in {first} stays as it is)"
+    assert kept_line(tmp_path / "comparison-16-goals-2") == told
+    assert kept_line(tmp_path / "else-2") == ""

@@ -10,6 +10,7 @@ import functools
 import itertools
 import json
 import os
+import shlex
 import shutil
 import sys
 import time
@@ -783,8 +784,19 @@ def test_settings_that_may_change_on_resume_are_applied_and_stored(run_copy, key
 )
 def test_settings_that_may_not_change_on_resume_are_refused_by_name(run_copy, setting, said):
     before = contents(run_copy)
-    assert said in refused(train.main, ["--resume", str(run_copy), "--set", setting])
+    answer = refused(train.main, ["--resume", str(run_copy), "--set", setting])
+    assert said in answer
     assert contents(run_copy) == before
+    if "may change" in answer:
+        # The setting comes first, and a complete command last.
+        assert answer.startswith(f"{setting.partition('=')[0]} = ")
+        words = shlex.split(answer.rpartition("`jetbot-mjx train ")[2].removesuffix("`"))
+        options = train._parser().parse_args(words)
+        assert (options.config, options.init_from) == (run_copy / "config.yaml", str(run_copy))
+        asked_for, proposed = (
+            load_config(options.config, settings) for settings in ([setting], options.overrides)
+        )
+        assert proposed == asked_for
 
 
 def test_the_same_command_with_another_configuration_is_refused(run_copy, smoke):

@@ -20,6 +20,7 @@ from jetbot_mjx.runs.run_dir import (
     atomic_folder,
     changed_versions,
     claim_run_dir,
+    is_occupied,
     make_folder,
     occupied,
     read_config,
@@ -84,6 +85,20 @@ def test_a_folder_is_free_when_the_process_that_held_it_was_killed(tmp_path):
         process.wait()
         with occupied(tmp_path):
             assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
+
+
+def test_who_asks_about_a_lock_refuses_no_training(tmp_path, monkeypatch):
+    assert not is_occupied(tmp_path)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / ".lock").touch()
+    assert not is_occupied(tmp_path)
+    with (tmp_path / ".lock").open() as onlooker:
+        run_dir.fcntl.flock(onlooker, run_dir.fcntl.LOCK_SH)
+        monkeypatch.setattr(run_dir.time, "sleep", lambda seconds: onlooker.close())
+        with occupied(tmp_path):
+            assert is_occupied(tmp_path)
+            assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
+    assert not is_occupied(tmp_path)
 
 
 def test_a_drive_that_refuses_to_close_the_lock_changes_nothing(tmp_path, monkeypatch):

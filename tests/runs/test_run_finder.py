@@ -105,6 +105,62 @@ def test_runs_are_listed_the_latest_first(runs):
     assert "stopped before its last step" in lines[-1]
 
 
+@pytest.mark.parametrize(
+    ("steps", "rates", "settings", "state", "mark", "footnote"),
+    [
+        (1_000_000, [0.5], {}, "complete", "", ""),
+        (600_000, [0.5], {}, "stopped", " *", "* stopped before its last step: "),
+        (600_000, [0.5], {"stop_at_success": 0.6}, "stopped", " *", "* stopped before its"),
+        (600_000, [0.6], {"stop_at_success": 0.6}, "reached", " +", "+ reached stop_at_success"),
+        # It was as good before, but its last evaluation did not end it.
+        (600_000, [0.7, 0.5], {"stop_at_success": 0.6}, "stopped", " *", "* stopped before its"),
+    ],
+)
+def test_a_list_says_why_a_training_ended(
+    tmp_path, capsys, steps, rates, settings, state, mark, footnote
+):
+    lines = [(steps - len(rates) + 1 + index, 1.0, rate) for index, rate in enumerate(rates)]
+    make_run(tmp_path / "run", *lines, ppo={"num_timesteps": 1_000_000}, **settings)
+    assert read_info(tmp_path / "run").state == state
+    assert list_runs_command.main([str(tmp_path)]) == 0
+    _, line, *rest = capsys.readouterr().out.splitlines()
+    assert f" {steps:,}{mark}  " in line
+    assert [one.startswith(footnote) for one in rest] == [True] * bool(footnote)
+    assert list_runs_command.main([str(tmp_path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["state"] == state
+
+
+def test_a_target_of_returns_counts_from_zero_too(tmp_path):
+    run = make_run(tmp_path / "run", environment="a:B", stop_at_return=-0.5)
+    line = {"env_steps": 1000, "timestamp": 1.0, "eval/episode_return": 0.0}
+    (run / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+    assert read_info(run).state == "reached"
+
+
+def test_of_several_seeds_all_have_to_reach_the_target(tmp_path):
+    run = make_run(tmp_path / "two", seeds=2, stop_at_success=0.6)
+    make_run(run / "seed-0", (100, 1.0, 0.7))
+    make_run(run / "seed-1", (100, 1.0, 0.5))
+    assert read_info(run).state == "stopped"
+    make_run(run / "seed-2", (100, 1.0, 0.5))
+    for seed in (1, 2):
+        (run / f"seed-{seed}" / "metrics.jsonl").unlink()
+        (run / f"seed-{seed}" / "config.yaml").unlink()
+    assert read_info(run).state == "reached"
+
+
+def test_a_run_that_is_being_trained_is_listed_as_running(runs, capsys):
+    with run_dir.occupied(runs / "runs/newer"):
+        assert list_runs_command.main(["runs"]) == 0
+        _, newer, _, *rest = capsys.readouterr().out.splitlines()
+        assert " 600,000 running  " in newer
+        assert not rest
+        assert [run.state for run in scan_runs()[0]] == ["running", "complete"]
+    # The lock's file stays, and the lock does not.
+    assert (runs / "runs/newer/.lock").is_file()
+    assert [run.state for run in scan_runs()[0]] == ["stopped", "complete"]
+
+
 LAUGHS = "a0: &a0 [x, x]\n" + "".join(
     f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 12)
 )
