@@ -4,6 +4,7 @@ There is one run for each of six configurations. The copies are run folders like
 evaluate them, render them, compare them with your own runs, or train them further.
 """
 
+import argparse
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +25,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="jetbot-mjx pretrained", description=__doc__)
     cli.add_output(parser, f"folder for the copies (default: {FOLDER})", FOLDER)
+    parser.add_argument("names", nargs="*", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
+    if options.names:
+        name = options.names[0].removeprefix("pretrained:")
+        parser.error(
+            f"{options.names[0]}: this command takes no names and copies all runs; as"
+            f" pretrained:{name} every command finds a run without a copy"
+        )
     with startup.exit_on_interrupt():
         from jetbot_mjx.runs import copy_pretrained
 

@@ -9,7 +9,7 @@ import argparse
 import re
 from collections.abc import Sequence
 
-from jetbot_mjx import cli, startup
+from jetbot_mjx import cli, errors, startup
 
 
 def _license(text: str) -> str:
@@ -17,6 +17,18 @@ def _license(text: str) -> str:
         raise argparse.ArgumentTypeError(
             f"{text!r} is no licence: write it as in apache-2.0 or mit"
         )
+    return text
+
+
+def _repository(text: str) -> str:
+    from jetbot_mjx.runs import parse_hub_name
+
+    try:
+        parse_hub_name(text)
+    except errors.InvalidError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no repository: write it as in hf:ada/jetbot"
+        ) from None
     return text
 
 
@@ -32,7 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = cli.Parser(prog="jetbot-mjx share", description=__doc__)
     cli.add_checkpoint_arguments(parser)
     repository = "repository, which is created if there is none, or replaced if it holds a run"
-    parser.add_argument("--to", required=True, metavar="hf:USER/NAME", help=repository)
+    parser.add_argument(
+        "--to", type=_repository, required=True, metavar="hf:USER/NAME", help=repository
+    )
     licence = "licence of the policy, as the Hub names it (default: apache-2.0)"
     parser.add_argument(
         "--license", type=_license, default="apache-2.0", metavar="NAME", help=licence

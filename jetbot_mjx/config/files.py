@@ -65,6 +65,8 @@ def find_config(name: str | Path, folders: Sequence[str] = _CONFIGS, what: str =
     shipped = shipped_configs(folders)
     if (found := shipped.get(path.name.removesuffix(".yaml"))) is not None:
         return found
+    if (meant := path.with_name(f"{path.name}.yaml")).is_file():
+        raise ConfigNotFoundError(f"{what} {name} does not exist: did you mean {meant}?")
     close = difflib.get_close_matches(path.stem, shipped, n=1)
     hint = f"did you mean {close[0]}?" if close else f"give a file, or one of {', '.join(shipped)}"
     raise ConfigNotFoundError(f"{what} {name} does not exist: {hint}")

@@ -55,7 +55,9 @@ def read_yaml(path: Path, what: str = "config") -> dict[str, object]:
         with path.open(encoding="utf-8") as file:
             text = file.read(_MOST_YAML_CHARACTERS + 1)
     except FileNotFoundError:
-        message = f"{what} {path} does not exist: give the path of a YAML file"
+        meant = path.with_name(f"{path.name}.yaml")
+        remedy = f"did you mean {meant}?" if meant.is_file() else "give the path of a YAML file"
+        message = f"{what} {path} does not exist: {remedy}"
         raise ConfigNotFoundError(message) from None
     except (OSError, ValueError) as error:
         if os.path.isdir(path):

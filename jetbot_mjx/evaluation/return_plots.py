@@ -2,6 +2,7 @@
 
 import matplotlib
 import numpy as np
+from jaxtyping import Bool
 from matplotlib.figure import Figure
 
 from jetbot_mjx.evaluation.learning_curves import RETURN, label_curves, plot_curve
@@ -18,10 +19,10 @@ def plot_returns(report: ReturnReport) -> Figure:
 
     Returns:
       The figure. Episodes that the environment ended have another colour than those that the time
-      limit ended.
+      limit ended, and so have successes, however they ended.
     """
     episodes = report.episodes
-    ended = np.asarray(episodes.terminated) > 0
+    kinds = _by_end(report)
     figure = Figure(figsize=(10.4, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     for axes, values, title in (
@@ -29,17 +30,31 @@ def plot_returns(report: ReturnReport) -> Figure:
         (right, np.asarray(episodes.steps, float), "length [steps]"),
     ):
         axes.hist(
-            [values[~ended], values[ended]],
+            [values[chosen] for _, _, chosen in kinds],
             bins=np.histogram_bin_edges(values, _BINS).tolist(),
             stacked=True,
-            color=["C0", "C1"],
-            label=["ended by the time limit", "terminated"],
+            color=[color for _, color, _ in kinds],
+            label=[label for label, _, _ in kinds],
         )
         axes.set(xlabel=title, ylabel="episodes")
         axes.set_axisbelow(True)
     left.axvline(report.policy.episode_return, color=_ink(), lw=1, ls="--", label="mean")
     left.legend(fontsize="small")
     return figure
+
+
+def _by_end(report: ReturnReport) -> list[tuple[str, str, Bool[np.ndarray, " n"]]]:
+    """Return label, colour and episodes of each way in which any episode ended."""
+    ended = np.asarray(report.episodes.terminated) > 0
+    kinds = [("ended by the time limit", "C0", ~ended), ("terminated", "C1", ended)]
+    if report.policy.success_rate is not None:
+        won = np.asarray(report.episodes.success) > 0
+        kinds = [
+            ("success", "C0", won),
+            ("no success, ended by the time limit", "C2", ~won & ~ended),
+            ("no success, terminated", "C1", ~won & ended),
+        ]
+    return [kind for kind in kinds if kind[2].any()]
 
 
 def plot_return_curve(report: ReturnReport) -> Figure:

@@ -15,6 +15,7 @@ from .checkpoint_store import stored_score as stored_score
 from .hub import RUN_FILES as RUN_FILES
 from .hub import RUN_FOLDERS as RUN_FOLDERS
 from .hub import check_upload as check_upload
+from .hub import parse_hub_name as parse_hub_name
 from .hub import upload_run as upload_run
 from .metrics import EVALUATION_VIDEO as EVALUATION_VIDEO
 from .metrics import METRICS as METRICS

@@ -18,7 +18,7 @@ from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, LayoutData, layout_data
 from jetbot_mjx.errors import InvalidError, UserError, os_errors, shown
 from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint_store import FOLDER, CheckpointError, CheckpointNotFoundError
-from jetbot_mjx.runs.run_dir import JsonObject, parse_stored
+from jetbot_mjx.runs.run_dir import JsonObject, parse_stored, shortened
 from jetbot_mjx.runs.run_finder import PRETRAINED as PRETRAINED
 from jetbot_mjx.runs.run_finder import ROOT, explain_missing, find_run, scan_runs, suggest_run
 from jetbot_mjx.runs.setup import Setup
@@ -218,20 +218,33 @@ def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
     Raises:
       CheckpointError: as for `load_checkpoint`.
     """
-    checkpoint = load_checkpoint(run_or_checkpoint, which)
-    policy = agents.make_policy(checkpoint.networks, checkpoint.params)
-    size, layout = checkpoint.about["observation_size"], checkpoint.about["layout"]
+    return _CheckedPolicy(load_checkpoint(run_or_checkpoint, which))
 
-    def checked_policy(
-        obs: agents.Observation, key: UInt32[Array, "2"] | None = None
+
+class _CheckedPolicy:
+    """A `_CheckedPolicy` is a policy that refuses observations of another size."""
+
+    def __init__(self, checkpoint: Checkpoint) -> None:
+        self._checkpoint = checkpoint
+        self._policy = agents.make_policy(checkpoint.networks, checkpoint.params)
+
+    def __call__(
+        self, obs: agents.Observation, key: UInt32[Array, "2"] | None = None
     ) -> Float[Array, "*batch action"]:
+        size, layout = (self._checkpoint.about[name] for name in ("observation_size", "layout"))
         if isinstance(size, int):
             _check_numbers(obs, size, layout)
         else:
             _check_parts(obs, size)
-        return policy(obs, key)
+        return self._policy(obs, key)
 
-    return checked_policy
+    def __repr__(self) -> str:
+        one = self._checkpoint
+        return (
+            f"Policy(run={str(shortened(one.run_dir))!r}, env_steps={one.env_steps},"
+            f" observation_size={one.about['observation_size']},"
+            f" action_size={one.about['action_size']})"
+        )
 
 
 def _check_numbers(obs: agents.Observation, size: int, layout: LayoutData) -> None:
@@ -309,6 +322,8 @@ def _find(path: Path, which: Which) -> Path:
     elif which == "best":
         # Prefer the later of equally good ones, because it was trained for longer.
         step = max(steps, key=lambda step: (checkpoint_store.stored_score(path, step), step))
+    elif not isinstance(which, int):
+        raise InvalidError(f"which = {which!r} is neither best, last nor a number of steps")
     elif which in steps:
         step = which
     else:

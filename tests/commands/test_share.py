@@ -47,7 +47,10 @@ def test_it_shares_what_it_is_told_to(hub, trained, monkeypatch, capsys):
     ("words", "line"),
     [
         ((), "the following arguments are required: --to"),
-        (("--to", "ada/x"), "error: ada/x: write hf:USER/NAME"),
+        (
+            ("--to", "ada/x"),
+            "argument --to: 'ada/x' is no repository: write it as in hf:ada/jetbot",
+        ),
         (("--to", "hf:eve/x"), "error: hf:eve/x: your token writes for ada, not for eve"),
         (("--to", "hf:ada/x", "--license", "MIT!"), "argument --license: 'MIT!' is no licence"),
     ],

@@ -15,6 +15,15 @@ def test_configurations_are_found_by_name(tmp_path, monkeypatch):
     assert load_config("smoke").seed == 77
 
 
+def test_a_file_of_ones_own_is_meant_before_those_of_the_package(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "more").mkdir()
+    for name in ("jetbo", "more/jetbo"):
+        (tmp_path / f"{name}.yaml").touch()
+        with pytest.raises(ConfigError, match=rf"{name} does not exist: did you mean {name}\.yaml"):
+            load_config(name)
+
+
 @pytest.mark.parametrize(
     ("name", "told"),
     [

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
+from matplotlib.colors import to_rgba
 
 from helpers.reports import return_report_of
 from jetbot_mjx.evaluation.curves import ReturnPoint
@@ -22,6 +24,37 @@ def test_histograms_hold_every_episode_by_how_it_ended():
         by_end = [sum(patch.get_height() for patch in bars) for bars in axes.containers]
         assert by_end == [3, 1]
     assert left.lines[0].get_xdata()[0] == report.policy.episode_return
+
+
+@pytest.mark.parametrize(
+    ("success", "terminated", "labels"),
+    [
+        (None, [0, 0, 0], ["ended by the time limit"]),
+        (None, [1, 0, 1], ["ended by the time limit", "terminated"]),
+        ([1, 1, 1], [1, 0, 1], ["success"]),
+        ([1, 0, 1], [1, 1, 0], ["success", "no success, terminated"]),
+        (
+            [0, 0, 1],
+            [0, 1, 0],
+            ["success", "no success, ended by the time limit", "no success, terminated"],
+        ),
+    ],
+)
+def test_histograms_tell_successes_and_name_only_what_they_show(success, terminated, labels):
+    report = return_report_of([1.0, 2.0, 3.0])
+    fields = {"success": success or [0, 0, 0], "terminated": terminated}
+    arrays = {name: np.array(values, np.float32) for name, values in fields.items()}
+    policy = report.policy._replace(success_rate=success and sum(success) / 3)
+    report = report._replace(episodes=report.episodes._replace(**arrays), policy=policy)
+    axes = plot_returns(report).axes[0]
+    told = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert sorted(told) == sorted(["mean", *labels])
+    heights = [patch.get_height() for patch in axes.patches]
+    assert sum(heights) == 3
+    colors = {patch.get_facecolor() for patch in axes.patches if patch.get_height()}
+    assert len(colors) == len(labels)
+    # Orange warns of episodes that ended without a success.
+    assert (to_rgba("C1") in colors) == any(one.endswith("terminated") for one in labels)
 
 
 def test_a_curve_shows_the_training_the_report_and_the_baselines():

@@ -151,6 +151,25 @@ def test_an_observation_of_another_size_is_refused_with_what_is_expected(smoke_r
     assert str(caught.value).endswith(f"; {got}")
 
 
+def test_a_policy_says_what_it_is_and_can_be_compiled(smoke_run, monkeypatch):
+    monkeypatch.chdir(smoke_run.parent)
+    policy = load_policy(smoke_run, "last")
+    assert repr(policy) == (
+        f"Policy(run='{smoke_run.name}', env_steps=65536, observation_size=7, action_size=2)"
+    )
+    observations = np.linspace(-1.0, 1.0, 21, dtype=np.float32).reshape(3, 7)
+    actions = np.asarray(policy(observations))
+    for compiled in (jax.jit(policy), jax.vmap(policy)):
+        np.testing.assert_allclose(np.asarray(compiled(observations)), actions, atol=1e-6)
+
+
+def test_a_word_that_names_no_checkpoint_is_refused_as_such(smoke_run):
+    with pytest.raises(
+        InvalidError, match=r"^which = 'lats' is neither best, last nor a number of"
+    ):
+        load_policy(smoke_run, "lats")
+
+
 def test_a_single_checkpoint_folder_can_be_loaded(smoke_run):
     folder = find_checkpoint(smoke_run, 16_384)
     assert load_checkpoint(folder).env_steps == 16_384
