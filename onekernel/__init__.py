@@ -40,7 +40,8 @@ The parts, each of which imports only from those before it:
 - `fused`: a function of one instance, which is traced and launched as one kernel
 - `explanation`: what the compiler made of it
 - `aot`: compiled programs from one process to the next
-- `mujoco`: the step of a MuJoCo model (`fuse_mjx`); the rest of the package needs no MuJoCo
+- `optimum`: the derivative of what MJX's constraint solver finds
+- `mujoco`: the step of a MuJoCo model (`fuse_mjx`); no part before these two needs MuJoCo
 
 `onekernel.build` exports the functions with which to write a kernel around a lowered function.
 """

@@ -84,7 +84,7 @@ class Kernel:
     """A function that is called with the reason where the fallback runs although the platform has a
     back end."""
     inline: Callable[..., list[Array]] | None = None
-    """The same computation again, with derivatives of all kinds; None: `fallback` has them."""
+    """The same computation as a function that JAX can differentiate; None: `fallback` is one."""
     derivatives: "Differentiable | None" = None
     """What differentiates the kernel; None: it cannot be differentiated."""
     on_batch: Callable[[], None] = lambda: None
@@ -137,7 +137,8 @@ class Kernel:
 
         Returns:
           A function of (carry, consts) that returns the new carry. The leaves of both pytrees are
-          the kernel's arguments and must be float32.
+          the kernel's arguments and must be float32. It can be differentiated if the kernel has
+          `derivatives`.
         """
 
         def step(carry: PyTree, consts: PyTree) -> PyTree:
@@ -156,7 +157,8 @@ class Kernel:
         """Return a kernel without a table as a JAX function of one instance; `jax.vmap` batches it.
 
         Returns:
-          A function from the kernel's arguments to its results.
+          A function from the kernel's arguments to its results. It can be differentiated if the
+          kernel has `derivatives`.
         """
         return lambda leaves: _kernel_p.bind(*leaves, kernel=self)
 

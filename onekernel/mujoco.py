@@ -14,9 +14,9 @@ The kernel is `mjx.step`, lowered to scalars for this one model: what follows fr
 constants alone is computed once, while it is lowered. The constraint solver is MJX's with the
 model's own limits (`iterations`, `ls_iterations`, `tolerance`), and its loops end as soon as it has
 converged. Results differ from those of `mjx.step` by round-off only, as long as all numbers are
-finite.
+finite. Its derivatives are kernels, too, with that of the solver's optimum (`onekernel.optimum`).
 
-This is the only module that needs MuJoCo and MJX: `pip install mujoco-mjx`.
+No other module but that one needs MuJoCo and MJX: `pip install mujoco-mjx`.
 """
 
 import contextlib
@@ -168,7 +168,7 @@ class FusedMjx:
         kernel = self._find_kernel((*held,))
         if self._on_unsupported == "raise" and kernel.unsupported:
             raise kernel.unsupported
-        step = self._xla_step if is_debugging() else kernel.as_step()
+        step = self._watched_step if is_debugging() else kernel.as_step()
         return MjxState(**{name: fields[name] for name in vars(state)} | step(carry, held))
 
     @property
@@ -259,6 +259,11 @@ class FusedMjx:
         """Make all physics steps with a loop that XLA compiles."""
         return jax.lax.fori_loop(0, self.n_substeps, lambda _, x: self._substep(x, held), carry)
 
+    def _watched_step(self, carry: Fields, held: Fields) -> Fields:
+        """Make all physics steps so that JAX names the operation of a NaN, also of a derivative."""
+        with differentiable_solver():
+            return self._xla_step(carry, held)
+
     def _differentiable_step(self, carry: Fields, held: Fields) -> Fields:
         """Make all physics steps with a loop that JAX can differentiate.
 
@@ -346,14 +351,18 @@ class FusedMjx:
         self._warn_of_derivative(f"one kernel cannot do {error}")
 
     def _warn_of_derivative(self, reason: str) -> None:
-        self._warn_once(reason, "the derivative of ")
+        """Warn that XLA compiles the derivative, once: a part forward and one backward are slow."""
+        what = "the derivative of mjx.step"
+        self._warn(f"XLA compiles {what}, which is slower: {reason}", what)
 
-    def _warn_once(self, reason: str, what: str = "") -> None:
-        """Warn that XLA compiles the step, or what of it, once for each reason."""
-        message = f"XLA compiles {what}mjx.step, which is slower: {reason}"
-        if self._on_unsupported == "warn" and message not in self._warned:
-            self._warned.add(message)
-            warnings.warn(message, stacklevel=4)
+    def _warn_once(self, reason: str) -> None:
+        """Warn that XLA compiles the step, once for each reason."""
+        self._warn(f"XLA compiles mjx.step, which is slower: {reason}", reason)
+
+    def _warn(self, message: str, about: str) -> None:
+        if self._on_unsupported == "warn" and about not in self._warned:
+            self._warned.add(about)
+            warnings.warn(message, stacklevel=5)
 
 
 def fuse_mjx(

@@ -17,6 +17,7 @@ this is the one of the side on which a is.
 import contextlib
 import threading
 from collections.abc import Callable, Iterator
+from typing import cast
 from unittest import mock
 
 import jax
@@ -74,12 +75,11 @@ def _solve(m: solver.Model, d: solver.Data) -> solver.Data:
         return at.Ma - d.qfrc_smooth - at.qfrc_constraint
 
     fixed_model, fixed_data = jax.lax.stop_gradient((m, d))
-    found = checkpoint_name(_iterate(fixed_model, fixed_data).qacc, SOLUTION)
-    qacc = jax.lax.custom_root(gradient, found, lambda _, guess: guess, _solve_linear)
+    optimum = checkpoint_name(_iterate(fixed_model, fixed_data).qacc, SOLUTION)
+    qacc = jax.lax.custom_root(gradient, optimum, lambda _, guess: guess, _solve_linear)
     at = context(qacc)
-    return d.tree_replace(
-        {"qacc": qacc, "qfrc_constraint": at.qfrc_constraint, "_impl.efc_force": at.efc_force}
-    )
+    found = {"qacc": qacc, "qfrc_constraint": at.qfrc_constraint, "_impl.efc_force": at.efc_force}
+    return cast(solver.Data, d.tree_replace(found))
 
 
 def _solve_linear(

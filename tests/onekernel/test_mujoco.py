@@ -224,11 +224,6 @@ def test_a_model_too_large_for_one_kernel_is_stepped_by_xla_with_one_warning(mon
         strict(strict.init(), jnp.zeros(0))
 
 
-def test_a_derivative_is_refused_in_words_of_the_step(falls):
-    with pytest.raises(KernelError, match=r"cannot be differentiated: use mjx\.step"):
-        jax.grad(lambda x: falls(falls.init(x), jnp.zeros(0)).qpos.sum())(jnp.zeros(1))
-
-
 @pytest.mark.parametrize(
     ("option", "said"),
     [('solver="PGS"', "mjSOL_PGS"), ('integrator="implicit"', "mjINT_IMPLICIT")],
