@@ -312,7 +312,7 @@ class FusedMjx:
         content = np.zeros(mujoco.mj_sizeModel(self.mj_model), np.uint8)
         mujoco.mj_saveModel(self.mj_model, None, content)
         program = LateProgram(
-            lambda: scalarize(self._substep, *arguments),
+            lambda: scalarize(self._substep, *arguments, skips=jax.default_backend() == "gpu"),
             [x.shape for x in leaves],
             [x.shape for x in jax.tree.leaves(arguments[0])],
         )

@@ -34,6 +34,7 @@ from onekernel.gpu.kernel_text import (
 )
 from onekernel.gpu.kernel_text import module_text as module_text
 from onekernel.kernel import Compiled, Kernel, probe
+from onekernel.lower import most_kept
 
 IMPL: str = "ptx"
 PLATFORM: str = "cuda"
@@ -49,6 +50,9 @@ the threads would wait 70 µs for 65,536 rows of 77 words."""
 _SHARED_BYTES = {70: 49_152, 80: 98_304, 90: 98_304}
 """Bytes of shared memory for these rows, by target architecture: all GPUs that can run code for the
 architecture have as much."""
+
+_REGISTERS = 255
+"""Most registers of a thread."""
 
 _BLOCKS = 128
 """Number of blocks from which on blocks grow instead: a GPU has about as many multiprocessors."""
@@ -120,7 +124,9 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
 
 def _shared_words(kernel: Kernel, architecture: int) -> int:
     """Return how many words of an instance are in shared memory; 0: it reads them directly."""
-    if kernel.table is not None:
+    # What a thread has no register for waits in a cache, which is the smaller the more of the same
+    # memory is shared: walker2d makes a fifth more steps without.
+    if kernel.table is not None or most_kept(kernel.program.block) > _REGISTERS:
         return 0
     # Shared memory holds the arguments first, and the results later.
     words = max(sum(kernel.argument_words), sum(kernel.result_words))

@@ -23,4 +23,5 @@ from .schedule import Block as Block
 from .schedule import Item as Item
 from .schedule import PlacedBranch as PlacedBranch
 from .schedule import PlacedLoop as PlacedLoop
+from .schedule import most_kept as most_kept
 from .schedule import recomputable as recomputable

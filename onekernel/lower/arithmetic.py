@@ -4,6 +4,7 @@ A rule is a function of the graph, the equation and its operands, one array of s
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -20,7 +21,19 @@ from onekernel.lower.indexing import (
     shape_of,
 )
 from onekernel.lower.random_rules import select
-from onekernel.lower.scalar_ir import DTYPES, ExprGraph, Scalar, bits_of, same_size
+from onekernel.lower.scalar_ir import (
+    DTYPES,
+    Expr,
+    ExprGraph,
+    Scalar,
+    bits_of,
+    equals,
+    is_constant,
+    same_size,
+)
+
+MIN_BRANCH_PRODUCTS = 9
+"""Fewest products in a matrix product's term that a branch skips."""
 
 _WORD, _LONG = np.dtype(np.uint32), np.dtype(np.uint64)
 
@@ -214,18 +227,72 @@ def _dot_general(
     rows = _group_axes(a, batch_a, sum_a)
     columns = _group_axes(b, batch_b, sum_b)
     dtype = np.dtype(dtype_of(equation.outvars[0]))
-    sums = []
+    sums: list[Scalar] = []
     for row_group, column_group in zip(rows, columns, strict=True):
-        for row in row_group:
-            for column in column_group:
-                total: Scalar = dtype.type(0)
-                for pair in zip(row, column, strict=True):
-                    # The operands may have different dtypes, such as int32 and float32.
-                    x, y = (graph.convert(scalar, dtype) for scalar in pair)
-                    product = graph.apply("mul", x, y)
-                    total = graph.apply("add", total, product)
-                sums.append(total)
+        # The operands may have different dtypes, such as int32 and float32.
+        left, right = (
+            [[graph.convert(x, dtype) for x in vector] for vector in group]
+            for group in (row_group, column_group)
+        )
+        multiply = _sums_of_terms if graph.skips and graph.finite else _sums
+        sums += multiply(graph, left, right, dtype.type(0))
     return scalar_array(sums, shape_of(equation.outvars[0]))
+
+
+_Vectors = Sequence[Sequence[Scalar]]
+
+
+def _sums(graph: ExprGraph, rows: _Vectors, columns: _Vectors, zero: Scalar) -> list[Scalar]:
+    """Return the sum of products of each row and each column, one sum after the other."""
+    sums = []
+    for row, column in itertools.product(rows, columns):
+        total = zero
+        for x, y in zip(row, column, strict=True):
+            total = graph.apply("add", total, graph.apply("mul", x, y))
+        sums.append(total)
+    return sums
+
+
+def _sums_of_terms(
+    graph: ExprGraph, rows: _Vectors, columns: _Vectors, zero: Scalar
+) -> list[Scalar]:
+    """Return the same sums; a branch around the i-th terms of all skips them where they are 0."""
+    totals = [zero] * (len(rows) * len(columns))
+    count = len(rows[0]) if totals else 0
+    for i in range(count):
+        left, right = ([vector[i] for vector in side] for side in (rows, columns))
+        products = [graph.apply("mul", x, y) for x, y in itertools.product(left, right)]
+        added = [graph.apply("add", *pair) for pair in zip(totals, products, strict=True)]
+        condition = _condition_of(left, right)
+        totals = added if condition is None else graph.branch(condition, totals, added)
+    return totals
+
+
+def _condition_of(left: Sequence[Scalar], right: Sequence[Scalar]) -> Expr | None:
+    """Return a truth value that is a factor of all products of two vectors' numbers.
+
+    None: there is none, or too few products to be worth a branch.
+    """
+    factors, others = ([x for x in side if not equals(x, 0)] for side in (left, right))
+    if len(factors) * len(others) < MIN_BRANCH_PRODUCTS:
+        return None
+    for side in (factors, others):
+        conditions = {_truth_in(x) for x in side}
+        if len(conditions) == 1:
+            return conditions.pop()
+    return None
+
+
+def _truth_in(x: Scalar) -> Expr | None:
+    """Return the truth value with which a number is multiplied last; None: it is with none."""
+    if is_constant(x):
+        return None
+    for factor in [x, *(x.operands if x.op == "mul" else ())]:
+        if not is_constant(factor) and factor.op == "convert":
+            (source,) = factor.operands
+            if not is_constant(source) and source.dtype.kind == "b":
+                return source
+    return None
 
 
 def _lowest(dtype: np.dtype) -> Scalar:

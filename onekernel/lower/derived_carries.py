@@ -2,9 +2,19 @@
 
 from collections.abc import Hashable
 
-from onekernel.lower.scalar_ir import ExprGraph, Loop, Scalar, identity, is_constant, is_same
+from onekernel.lower.scalar_ir import (
+    Branch,
+    Expr,
+    ExprGraph,
+    Loop,
+    Scalar,
+    identity,
+    is_constant,
+    is_same,
+)
 
 _PairKey = tuple[Hashable, ...]
+_Branches = dict[tuple[int, int], list[Scalar]]
 
 
 def find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, Scalar]:
@@ -19,6 +29,7 @@ def find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, S
       How each derived value is computed from the others, by its place.
     """
     derived: dict[int, Scalar] = {}
+    branches: _Branches = {}
     known: dict[_PairKey, Scalar] = {}
     # Begin with the values that were recorded first, because others may be derived from them.
     for place in sorted(carried, key=lambda k: _index(loop.updated[k])):
@@ -27,7 +38,7 @@ def find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, S
         pair = loop.initial[place], loop.updated[place]
         found = known.get(_pair_key(pair))
         if found is None:
-            found = _matched(graph, known, *pair)
+            found = _matched(graph, known, branches, *pair)
         if found is not None:
             derived[place] = found
         # From here on, this pair is computed from the carried or derived value.
@@ -36,7 +47,11 @@ def find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, S
 
 
 def _matched(
-    graph: ExprGraph, known: dict[_PairKey, Scalar], before: Scalar, after: Scalar
+    graph: ExprGraph,
+    known: dict[_PairKey, Scalar],
+    branches: _Branches,
+    before: Scalar,
+    after: Scalar,
 ) -> Scalar | None:
     """Return one expression for both `before` and `after`; None if there is none.
 
@@ -44,6 +59,7 @@ def _matched(
       graph: the graph, to which the expression is added.
       known: for pairs of a value before the loop and after an iteration, the scalar that has this
         value at the start of every iteration.
+      branches: the results of the branches that have been added for two equal ones.
       before: a carried value before the first iteration.
       after: the same value after an iteration.
     """
@@ -58,7 +74,7 @@ def _matched(
             pending.pop()
             continue
         # An operation on different values matches if all of its operands do.
-        parts = _parts(*pair)
+        parts = _parts(branches, *pair)
         if parts is None:
             # The two have no common operation, so the expressions that contain them differ.
             return None
@@ -79,16 +95,47 @@ def _matched(
             pending += missing
             continue
         # All operands are there: record the operation once more, on them.
-        _, operation = pair
-        assert not is_constant(operation)
-        found[key] = graph.repeat(operation, operands)
+        found[key] = _repeated(graph, branches, pair, operands)
         pending.pop()
     return found[_pair_key((before, after))]
 
 
-def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
-    """Return the operands of two equal operations in pairs; None if the operations differ."""
-    if is_constant(before) or is_constant(after) or not before.operands:
+def _repeated(
+    graph: ExprGraph, branches: _Branches, pair: tuple[Scalar, Scalar], operands: list[Scalar]
+) -> Scalar:
+    """Record what a pair has in common once more, on the operands that `_parts` asked for."""
+    one, other = pair
+    assert isinstance(one, Expr)
+    assert isinstance(other, Expr)
+    if not isinstance(other.owner, Branch):
+        return graph.repeat(other, operands)
+    assert one.owner is not None
+    # A branch is recorded with all of its results, and once.
+    both = one.owner.index, other.owner.index
+    if both not in branches:
+        condition, *sides = operands
+        half = len(sides) // 2
+        branches[both] = graph.branch(condition, sides[:half], sides[half:])
+    return branches[both][other.place]
+
+
+def _parts(
+    branches: _Branches, before: Scalar, after: Scalar
+) -> list[tuple[Scalar, Scalar]] | None:
+    """Return the operands of two equal operations in pairs; None if the operations differ.
+
+    Those of a branch are its condition and all of its sides, or none if it is there already.
+    """
+    if is_constant(before) or is_constant(after):
+        return None
+    one, other = before.owner, after.owner
+    if isinstance(one, Branch) and isinstance(other, Branch) and before.place == after.place:
+        if (one.index, other.index) in branches:
+            return []
+        parts = [[x.condition, *x.if_false, *x.if_true] for x in (one, other)]
+        # A branch of another size is another branch.
+        return list(zip(*parts, strict=True)) if len(parts[0]) == len(parts[1]) else None
+    if not before.operands:
         return None
     if before.op != after.op or before.dtype != after.dtype or before.op == "input":
         return None

@@ -174,6 +174,7 @@ def scalarize(
     *arguments: PyTree,
     finite: bool = True,
     approximate: bool = False,
+    skips: bool = False,
 ) -> ScalarProgram:
     """Lower a function to a program on scalars; the module states the protocol.
 
@@ -183,6 +184,9 @@ def scalarize(
       finite: whether all numbers are finite, as for `ExprGraph`.
       approximate: whether exp, log and 1/x are operations, which only GPUs have instructions for:
         approximate ones. Otherwise exp and log become polynomials.
+      skips: whether matrix products skip, by a branch, the terms with a truth value that is false,
+        such as the forces of a contact that does not touch. That pays where a thread computes an
+        instance. The lanes of a vector skip what is false for all of them, which is seldom.
 
     Returns:
       The program.
@@ -192,7 +196,8 @@ def scalarize(
     """
     closed = jax.make_jaxpr(function)(*arguments)
     variables = closed.jaxpr.invars, closed.jaxpr.outvars
-    return scalarize_part(closed, *variables, finite=finite, approximate=approximate)
+    options = {"finite": finite, "approximate": approximate, "skips": skips}
+    return scalarize_part(closed, *variables, **options)
 
 
 def scalarize_part(
@@ -203,6 +208,7 @@ def scalarize_part(
     words: bool = False,
     finite: bool = True,
     approximate: bool = False,
+    skips: bool = False,
 ) -> ScalarProgram:
     """Lower the part of a traced function between some of its variables, as `scalarize` does.
 
@@ -215,6 +221,7 @@ def scalarize_part(
         float32 with their bits, those of 64 bits as two (see `bitcast`), and a bool as 0 or 1.
       finite: whether all numbers are finite, as for `ExprGraph`.
       approximate: as for `scalarize`.
+      skips: likewise.
 
     Returns:
       The program.
@@ -224,7 +231,7 @@ def scalarize_part(
     """
     _reject_effects(closed)
     # Start with the program's arguments, each split into scalars of the graph.
-    graph = make_graph(finite=finite, approximate=approximate)
+    graph = make_graph(finite=finite, approximate=approximate, skips=skips)
     lowering = _JaxprLowering(graph)
     env: dict[Var, ScalarArray] = {}
     inputs = []

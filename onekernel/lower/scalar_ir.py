@@ -288,14 +288,17 @@ a formula of basic operations; None: there is none."""
 class ExprGraph:
     """An `ExprGraph` records operations on scalars, each of them once."""
 
-    def __init__(self, simplifications: Mapping[str, Simplify], *, finite: bool) -> None:
+    def __init__(
+        self, simplifications: Mapping[str, Simplify], *, finite: bool, skips: bool = False
+    ) -> None:
         """Start with an empty graph.
 
         Args:
           simplifications: a function for each operation that may be an equal but simpler scalar.
           finite: whether all numbers are finite, and angles at most 10⁴.
+          skips: whether matrix products skip what is multiplied by a truth value that is false.
         """
-        self.finite = finite
+        self.finite, self.skips = finite, skips
         self._simplifications = simplifications
         self._values: dict[tuple[Hashable, ...], Expr] = {}
         self._made: dict[tuple[str, int], list[Scalar]] = {}

@@ -127,6 +127,33 @@ def recomputable(loop: PlacedLoop) -> frozenset[int]:
     Returns:
       The indices of these values.
     """
+    outside = _from_before(loop)
+    return frozenset(
+        index
+        for index, x in outside.items()
+        if x.op in _CHEAP
+        and x.dtype.kind == "f"
+        and all(operand.index in outside for operand in _expressions(x.operands))
+    )
+
+
+def most_kept(block: Block) -> int:
+    """Return the most numbers that one of a block's loops keeps during its iterations.
+
+    That is how many registers it needs, besides those for what an iteration computes.
+    """
+    return max(
+        (
+            len(item.places) + len(_from_before(item).keys() - recomputable(item))
+            for item in block.items
+            if isinstance(item, PlacedLoop)
+        ),
+        default=0,
+    )
+
+
+def _from_before(loop: PlacedLoop) -> dict[int, Expr]:
+    """Return the values from before a loop that it uses, by their indices."""
     read: dict[int, Expr] = {}
     made: set[int] = set()
     pending: list[Item] = [loop]
@@ -144,14 +171,7 @@ def recomputable(loop: PlacedLoop) -> frozenset[int]:
         made |= {x.index for x in values}
         if not isinstance(item, Expr):
             pending += [inner for block in item.blocks for inner in block.items]
-    outside = {index: x for index, x in read.items() if index not in made}
-    return frozenset(
-        index
-        for index, x in outside.items()
-        if x.op in _CHEAP
-        and x.dtype.kind == "f"
-        and all(operand.index in outside for operand in _expressions(x.operands))
-    )
+    return {index: x for index, x in read.items() if index not in made}
 
 
 def _read_by_loop(item: PlacedLoop, *, is_outermost: bool) -> list[Scalar]:

@@ -26,14 +26,16 @@ from onekernel.lower.scalar_ir import (
 _BOOL = np.dtype(bool)
 
 
-def make_graph(*, finite: bool = True, approximate: bool = False) -> ExprGraph:
+def make_graph(*, finite: bool = True, approximate: bool = False, skips: bool = False) -> ExprGraph:
     """Return an empty graph.
 
     Args:
       finite: whether all numbers are finite, and angles at most 10⁴.
       approximate: whether to record exp, log and 1/x, which GPUs have approximate instructions for.
+      skips: as for `ExprGraph`.
     """
-    return ExprGraph(_SIMPLIFY | _APPROXIMATE if approximate else _SIMPLIFY, finite=finite)
+    simplifications = _SIMPLIFY | _APPROXIMATE if approximate else _SIMPLIFY
+    return ExprGraph(simplifications, finite=finite, skips=skips)
 
 
 _NEUTRAL = {"add": 0, "and": True, "mul": 1, "or": False, "xor": False}

@@ -705,3 +705,68 @@ def test_the_primitives_with_a_rule_are_listed_once():
     assert len(names) == len(set(names)) > 100
     assert {"scan", "while", "cond", "sin", "dot_general", "gather", "erf", "qr"} <= {*names}
     assert not {"fft", "eigh", "lgamma"} & {*names}
+
+
+def hessian(rows, x):
+    """What Newton's method makes of the rows whose sum is negative."""
+    active = rows @ x < 0
+    return (rows.T * 2.0 * active) @ rows
+
+
+def descent(rows, x):
+    """Newton's method, which makes what the next iteration needs at the end of one."""
+
+    def prepared(x):
+        return x, hessian(rows, x) + jnp.eye(4)
+
+    def closer(carry):
+        x, matrix = carry
+        return prepared(x - 0.1 * matrix @ x)
+
+    return jax.lax.while_loop(lambda carry: (carry[0] ** 2).sum() > 1e-2, closer, prepared(x))[0]
+
+
+ROWS = jax.ShapeDtypeStruct((6, 4), jnp.float32), VECTOR
+
+
+def placed(program, kind):
+    """The loops, or branches, of a program, wherever they are."""
+    found, pending = [], [program.block]
+    while pending:
+        for item in pending.pop().items:
+            if isinstance(item, kind):
+                found.append(item)
+            pending += [] if isinstance(item, Expr) else item.blocks
+    return found
+
+
+@pytest.mark.parametrize("function", [hessian, descent])
+def test_what_is_multiplied_by_false_is_skipped(function):
+    plain, skipping = (jaxpr.scalarize(function, *ROWS, skips=skips) for skips in (False, True))
+    rng = np.random.default_rng(0)
+    rows = np.float32(rng.normal(size=(50, 6, 4)))
+    # In some instances every row counts, in others none.
+    rows[:10], rows[10:20] = -np.abs(rows[:10]), np.abs(rows[10:20])
+    points = np.abs(np.float32(rng.normal(size=(50, 4))))
+    one, other = (evaluate(program, [rows, points])[0] for program in (plain, skipping))
+    np.testing.assert_array_equal(one, other)
+    assert not placed(plain, PlacedBranch)
+    assert len(placed(skipping, PlacedBranch)) >= 6
+
+
+def test_a_loop_does_not_carry_what_branches_make_of_what_it_carries():
+    # The matrix follows from x: it is made where an iteration begins, and not before the loop too.
+    for skips in (False, True):
+        (loop,) = placed(jaxpr.scalarize(descent, *ROWS, skips=skips), PlacedLoop)
+        assert len(loop.places) == 4
+
+
+def test_few_products_are_not_worth_a_branch():
+    def few(rows, x):
+        return (rows.T * (rows @ x < 0)) @ rows[:, :1]
+
+    assert not placed(jaxpr.scalarize(few, *ROWS, skips=True), PlacedBranch)
+
+
+def test_numbers_that_may_be_infinite_are_not_skipped():
+    assert not placed(jaxpr.scalarize(hessian, *ROWS, skips=True, finite=False), PlacedBranch)

@@ -118,6 +118,17 @@ def test_arrays_are_in_the_threads_own_memory(name):
     assert text.count("st.global") == 4
 
 
+def test_rows_are_not_in_shared_memory_where_threads_lack_registers(monkeypatch):
+    def halved(x):
+        return jax.lax.while_loop(lambda x: x[0] > 1, lambda x: x * 0.5, x)
+
+    long = kernel(halved, jax.ShapeDtypeStruct((40,), jnp.float32))
+    assert "ld.shared" in gpu.compiled(long, 90)
+    # The loop carries 40 numbers.
+    monkeypatch.setattr(gpu, "_REGISTERS", 39)
+    assert "ld.shared" not in gpu.compiled(long, 90)
+
+
 @pytest.mark.parametrize(
     ("robots", "threads"),
     [(1, 32), (4096, 32), (4097, 64), (16384, 128), (65536, 256), (10**7, 256)],

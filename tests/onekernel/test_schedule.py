@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from onekernel.lower.scalar_ir import Expr
-from onekernel.lower.schedule import PlacedBranch, PlacedLoop, recomputable, schedule
+from onekernel.lower.schedule import (
+    PlacedBranch,
+    PlacedLoop,
+    most_kept,
+    recomputable,
+    schedule,
+)
 
 ONE = np.float32(1)
 
@@ -299,3 +305,16 @@ def test_what_costs_more_than_a_register_is_not_recomputable(graph, x, op):
         return graph.apply("mul", graph.apply("mul", carry, root), x)
 
     assert recomputable(loop_with(graph, first, body)) == frozenset()
+
+
+def test_a_loop_keeps_what_it_carries_and_what_it_uses_from_before(graph, x):
+    first = graph.input(np.float32)
+    root, product = graph.apply("sqrt", x), graph.apply("mul", x, x)
+
+    def body(carry):
+        total = graph.apply("mul", graph.apply("mul", carry, root), product)
+        return [graph.apply("add", total, x)]
+
+    # It carries a number, and uses x, its root, and its square, which it can compute again.
+    assert most_kept(schedule(loop_of(graph, [first], body))) == 3
+    assert most_kept(schedule([root, product])) == 0
