@@ -1,8 +1,9 @@
 """Provide what all commands share: arguments and their types, one-line errors, exit codes.
 
-The exit codes are: 0 success · 1 finished, but below the requested `--min-success`, or a plan that
-does not fit · 2 an error that the user can correct · 75 a training that was asked to stop, is
-saved, and continues with the same command · 130 interrupted.
+The exit codes are: 0 success · 1 finished, but below the requested `--min-success`, a plan that
+does not fit, or what `docs/stop-and-resume.md` lists of other commands · 2 an error that the user
+can correct · 75 a training that was asked to stop, is saved, and continues with the same command ·
+130 interrupted.
 
 A command module imports only this module at its top, and the rest in `main`, after it has parsed
 its arguments: a mistyped command answers before JAX, MuJoCo or NumPy is imported. For the same
@@ -19,7 +20,7 @@ import shlex
 import sys
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeVar
 
 from jetbot_mjx import errors, startup
 from jetbot_mjx.errors import UserError
@@ -42,6 +43,10 @@ _BY_POSITION = "config_by_position"
 class Parser(argparse.ArgumentParser):
     """An argument parser that reports an error in one line, with a likely remedy."""
 
+    def __init__(self, **options: Any) -> None:
+        """Create a parser that takes the names of options in full, so that a typo is told."""
+        super().__init__(**options, allow_abbrev=False)
+
     def parse_args(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
@@ -55,7 +60,7 @@ class Parser(argparse.ArgumentParser):
                 taken = {one.metavar for one in self._actions} & _LISTS.keys() or _LISTS
                 hint = " and ".join(text for metavar, text in _LISTS.items() if metavar in taken)
                 self.error(f"unrecognized arguments: {name}: {hint}")
-            if name.startswith("--") and not any(one.startswith(name) for one in options):
+            if name.startswith("--") and name not in options and name != "--":
                 self.error(f"unrecognized arguments: {name}{self._remedy(word, name)}")
         self._refuse_bare_settings(words)
         parsed, extra = self.parse_known_args(words, namespace)

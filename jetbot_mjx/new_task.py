@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("module", type=Path, metavar="MODULE.py", help="file to be written")
     module = parser.parse_args(arguments).module
     config = write_task_template(module)
-    cli.tell_written((module, config), "check-env --config")
+    cli.tell_written((module, config), "check-env")
     return 0
 
 

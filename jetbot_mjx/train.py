@@ -26,7 +26,10 @@ def _parser() -> cli.Parser:
     cli.add_count(parser, "--seed", seed, least=0, most=2**32 - 1)
     cli.add_count(parser, "--seeds", "train N policies at once, the same as --set seeds=N")
     parser.add_argument(
-        "--init-from", metavar="RUN", help="start from the policy of another run, of any task"
+        "--init-from",
+        metavar="RUN",
+        help="start from the policy of another run, of any task; it explores anew, so that it does"
+        " worse at first than in that run",
     )
     parser.add_argument(
         "--run-dir", type=Path, help="run folder (default: runs/<config>-<date>-<time>)"

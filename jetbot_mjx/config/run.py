@@ -250,11 +250,20 @@ class Config(Section):
         Args:
           changed: the configuration to resume the run with.
         """
+        changes = self.changes(changed)
+        return {key: both for key, both in changes.items() if key not in CHANGEABLE_ON_RESUME}
+
+    def changes(self, changed: "Config") -> dict[str, tuple[Setting, Setting]]:
+        """Return the settings that differ, each before and after.
+
+        Args:
+          changed: the other configuration.
+        """
         now, then = changed.flat(), self.flat()
         return {
             key: (then.get(key), now.get(key))
             for key in {**then, **now}
-            if then.get(key) != now.get(key) and key not in CHANGEABLE_ON_RESUME
+            if then.get(key) != now.get(key)
         }
 
     def check_cpu_devices(self, local_device_count: int) -> None:

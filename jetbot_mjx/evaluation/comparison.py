@@ -208,6 +208,19 @@ def few_seeds_line(results: Iterable[Aggregate]) -> str:
     )
 
 
+def won_on(what: str, seeds: int, runs: Iterable[_OfSeeds]) -> str:
+    """Return what is won and lost one by one, and of which seeds where not all of them count.
+
+    Args:
+      what: `goals` or `starts`.
+      seeds: number of seeds of each run that are compared, counted from the first.
+      runs: the runs that are compared.
+    """
+    if all(len(run.seeds) == seeds for run in runs):
+        return what
+    return f"{what} of the first {'seed' if seeds == 1 else f'{seeds} seeds'} of each"
+
+
 def check_comparable(configs: Mapping[str, Config]) -> None:
     """Raise an error if runs did not train for the same task.
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from jetbot_mjx.evaluation.comparison import few_seeds_line
+from jetbot_mjx.evaluation.comparison import few_seeds_line, won_on
 from jetbot_mjx.evaluation.result_names import kept_line
 from jetbot_mjx.evaluation.return_report import ReturnComparison, ReturnReport
 from jetbot_mjx.evaluation.returns import ReturnSummary
@@ -42,10 +42,10 @@ def summarize_return_comparison(comparison: ReturnComparison) -> str:
         _policies_table({**policies, **comparison.baselines}),
         f"\n{text_table(rows)}\n{few_seeds_line(run.episode_return for run in runs)}",
     ]
-    lines += [
-        f"{pair.a} against {pair.b}: {pair.episode_return.told('{:+z.2f}', 'starts')}"
-        for pair in comparison.pairs
-    ]
+    by_name = {run.name: run for run in runs}
+    for pair in comparison.pairs:
+        starts = won_on("starts", pair.seeds, (by_name[pair.a], by_name[pair.b]))
+        lines.append(f"{pair.a} against {pair.b}: {pair.episode_return.told('{:+z.2f}', starts)}")
     lines += comparison.other_code
     page = comparison.folder / "comparison.html"
     return "\n".join([*lines, f"report: {page}{kept_line(comparison.folder)}"])

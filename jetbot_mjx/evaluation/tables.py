@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation.comparison import Comparison, few_seeds_line, told_step_cost
+from jetbot_mjx.evaluation.comparison import Comparison, few_seeds_line, told_step_cost, won_on
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.report import Report
@@ -207,14 +207,15 @@ def runs_table(comparison: Comparison) -> str:
 
 def pairs_table(comparison: Comparison) -> str:
     """Return a table that compares every two runs with each other."""
-    lines = []
+    lines, runs = [], {run.name: run for run in comparison.runs}
     for pair in comparison.pairs:
+        goals = won_on("goals", pair.seeds, (runs[pair.a], runs[pair.b]))
         lines.append(f"{pair.a} against {pair.b}")
         quantities = (
             ("success", pair.success_rate, "{:+.2%}"),
             ("time", pair.time_to_goal, "{:+.3f} s"),
         )
-        lines += [f"  {name:8}  {result.told(form, 'goals')}" for name, result, form in quantities]
+        lines += [f"  {name:8}  {result.told(form, goals)}" for name, result, form in quantities]
     return "\n".join(lines)
 
 

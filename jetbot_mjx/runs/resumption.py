@@ -65,7 +65,9 @@ def check_resumed(run_dir: Path, stored: Config, config: Config) -> None:
     changes = stored.fixed_changes(config)
     # The command names another policy to begin with.
     settings = [
-        f"--set={key}={json.dumps(now)}" for key, (_, now) in changes.items() if key != "init_from"
+        f"--set={key}={json.dumps(now)}"
+        for key, (_, now) in stored.changes(config).items()
+        if key != "init_from"
     ]
     command = ["jetbot-mjx", "train", str(run_dir / CONFIG), "--init-from", str(run_dir), *settings]
     try:

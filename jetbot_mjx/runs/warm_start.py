@@ -63,7 +63,11 @@ class WarmStart(NamedTuple):
 
     def describe(self) -> str:
         """Return one line that says what was taken over."""
-        parts = [f"begins with the policy of {self.source} after {self.env_steps:,} steps"]
+        parts = [
+            f"begins with the policy of {self.source} after {self.env_steps:,} steps",
+            f"to explore again, its last layer is scaled by {MEAN_SCALE} and its noise is new:"
+            " expect less of it at first",
+        ]
         if self.new:
             parts.append(f"new in its observation: {', '.join(self.new)}")
         if self.dropped:

@@ -155,6 +155,7 @@ def _lines(stream: TextIO) -> _Display:
     @contextlib.contextmanager
     def show(name: str, total: int | None) -> Iterator[Advance]:
         done, began = 0, time.monotonic()
+        first: tuple[int, float] | None = None  # what was done at the first report, and when
         last_line = began
         finished = threading.Event()
 
@@ -168,8 +169,10 @@ def _lines(stream: TextIO) -> _Display:
                     say_how_far()
 
         def advance(count: int) -> None:
-            nonlocal done
+            nonlocal done, first
             done += count
+            if first is None:
+                first = done, time.monotonic()
             if total and done < total:
                 say_how_far()
 
@@ -180,8 +183,10 @@ def _lines(stream: TextIO) -> _Display:
                 return
             last_line = now
             counted = "" if total is None else f" {done:,} of {total:,},"
-            if total and done:
-                say(f"{name}:{counted} about {(now - began) * (total - done) / done:.0f} s left")
+            # What came first has compiled, too, and says nothing about the rest.
+            if total and first and done > first[0]:
+                left = (now - first[1]) * (total - done) / (done - first[0])
+                say(f"{name}:{counted} about {left:.0f} s left")
             else:
                 say(f"{name}:{counted} {now - began:.0f} s so far")
 

@@ -422,6 +422,20 @@ def test_a_mistake_costs_one_line(tmp_path, arguments, said):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("command", "arguments", "meant"),
+    [
+        ("evaluate", ["run", "--robustnes"], "--robustness"),
+        ("train", ["jetbot", "--run-di", "there"], "--run-dir"),
+        ("render", ["run", "--checkp=last"], "--checkpoint"),
+    ],
+)
+def test_an_option_that_is_cut_off_is_not_taken_but_answered(refused, command, arguments, meant):
+    option = arguments[1].partition("=")[0]
+    line = refused(COMMANDS[command], *arguments)
+    assert f"unrecognized arguments: {option}: did you mean {meant}?" in line
+
+
 def test_no_mistake_is_answered_by_trust(capsys):
     with pytest.raises(SystemExit):
         COMMANDS["render"].main(["runs/mine", "--truts"])

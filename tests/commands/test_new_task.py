@@ -15,9 +15,9 @@ from jetbot_mjx.training import session
 def test_what_is_written_passes_the_checks_and_trains(tmp_path, capsys):
     assert new_task.main([str(tmp_path / "park_here.py")]) == 0
     config = tmp_path / "park_here.yaml"
-    assert f"--config {config}" in capsys.readouterr().out
+    assert f"jetbot-mjx check-env {config}\n" in capsys.readouterr().out
     with gliding.everywhere():
-        assert check_env.main(["--config", str(config)]) == 0
+        assert check_env.main([str(config)]) == 0
         result = session.run(load_config(config, TINY), tmp_path / "run")
     assert result.finished
     written = (tmp_path / "park_here.py").read_text("utf-8") + config.read_text("utf-8")

@@ -91,6 +91,22 @@ def test_more_seeds_of_one_run_do_not_weigh_goal_by_goal():
     assert (pair.seeds, pair.success_rate.wins, pair.success_rate.losses) == (1, 1, 1)
 
 
+@pytest.mark.parametrize(
+    ("counts", "told"),
+    [
+        ((1, 1), "goals 0 : 0 (p 1)"),
+        ((3, 3), "goals 0 : 0 (p 1)"),
+        ((3, 1), "goals of the first seed of each 0 : 0 (p 1)"),
+        ((2, 3), "goals of the first 2 seeds of each 0 : 0 (p 1)"),
+    ],
+)
+def test_of_unequal_numbers_of_seeds_it_is_told_whose_goals_are_counted(counts, told):
+    seeds = [[report_of(wins(8))] * count for count in counts]
+    lines = pairs_table(comparison_of(**dict(zip("ab", seeds, strict=True)))).splitlines()
+    assert len(lines) == 3
+    assert all(line.endswith(f", {told}") for line in lines[1:])
+
+
 def test_every_two_runs_meet():
     runs = {name: [report_of(wins(5))] for name in "abcd"}
     met = [(pair.a, pair.b) for pair in comparison_of(**runs).pairs]

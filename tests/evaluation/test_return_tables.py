@@ -34,7 +34,7 @@ def test_a_comparison_shows_policies_runs_and_pairs():
     assert any(line.startswith("b ") and line.endswith("2 episodes") for line in lines)
     assert sum(line.startswith("intervals over few seeds") for line in lines) == 1
     assert lines[-2].startswith("a against b: difference -2.00")
-    assert lines[-2].endswith("starts 1 : 1 (p 1)")
+    assert lines[-2].endswith(", starts of the first seed of each 1 : 1 (p 1)")
     assert lines[-1] == "report: there/comparison.html"
 
 

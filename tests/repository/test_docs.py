@@ -416,6 +416,20 @@ def test_settings_that_may_change_are_listed():
     assert tuple(re.findall(r"`([\w.]+)`", text.partition(". Anything")[0])) == CHANGEABLE_ON_RESUME
 
 
+def test_every_command_that_may_exit_with_1_is_listed(root):
+    text = PAGES["stop-and-resume.md"].partition("## Exit codes")[2].partition("\n## ")[0]
+    listed = {cells[1].strip("`") for cells in rows(text) if cells[0] == "1"}
+    sources = {path: path.read_text("utf-8") for path in (root / "jetbot_mjx").glob("*.py")}
+    ends_with_1 = {
+        path.stem.replace("_", "-")
+        for path, source in sources.items()
+        if re.search(r"^[A-Z]\w+ = 1$", source, re.MULTILINE)
+    }
+    assert listed == ends_with_1
+    for_agents = next(cells for cells in rows(PAGES["agents.md"]) if cells[0] == "1")
+    assert listed <= set(re.findall(r"`([\w-]+)`", for_agents[1]))
+
+
 # Metrics.
 
 

@@ -799,6 +799,18 @@ def test_settings_that_may_not_change_on_resume_are_refused_by_name(run_copy, se
         assert proposed == asked_for
 
 
+def test_the_command_that_is_proposed_has_all_settings_that_were_given(run_copy):
+    given = ["ppo.learning_rate=3e-3", "ppo.num_timesteps=131072", "stop_at_success=0.9"]
+    answer = refused(
+        train.main, ["--resume", str(run_copy), *(f"--set={setting}" for setting in given)]
+    )
+    assert "leave ppo.learning_rate out" in answer
+    words = shlex.split(answer.rpartition("`jetbot-mjx train ")[2].removesuffix("`"))
+    options = train._parser().parse_args(words)
+    config = run_copy / "config.yaml"
+    assert load_config(config, options.overrides) == load_config(config, given)
+
+
 def test_the_same_command_with_another_configuration_is_refused(run_copy, smoke):
     arguments = ["--config", smoke, "--run-dir", str(run_copy), "--seed", "3"]
     said = refused(train.main, arguments)

@@ -217,7 +217,9 @@ def test_a_training_begins_with_it_and_resumes_without_it(tmp_path, capsys):
     run_dir = tmp_path / "run"
     config = config_of(init_from=str(copied))
     first = session.run(config, run_dir, verbose=True)
-    assert f"begins with the policy of {copied}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"begins with the policy of {copied}" in said
+    assert "its last layer is scaled by 0.25 and its noise is new: expect less of it" in said
     start = load_checkpoint(run_dir, 0).params
     np.testing.assert_array_equal(
         start.value["params"]["hidden_1"]["kernel"],

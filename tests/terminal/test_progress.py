@@ -56,12 +56,25 @@ def test_a_long_stage_tells_how_far_it_is_and_how_long_it_will_take(monkeypatch)
     ]
 
 
+def test_the_first_item_which_compiles_says_nothing_about_the_time_left(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    stream = io.StringIO()
+    with show_progress(stream), stage("policies", 3) as advance:
+        for seconds in (60.0, 12.0, 12.0):
+            now[0] += seconds
+            advance(1)
+    said = [line.split(" s  ")[1] for line in stream.getvalue().splitlines()]
+    assert said == ["policies: 1 of 3, 60 s so far", "policies: 2 of 3, about 12 s left"]
+
+
 def test_a_stage_that_advances_slowly_tells_how_long_it_will_take(monkeypatch):
     monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 0.0)
     monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.2)
     stream = io.StringIO()
     with show_progress(stream), stage("frames", 100) as advance:
-        advance(50)
+        advance(25)
+        advance(25)
         deadline = time.monotonic() + 10
         while stream.getvalue().count("\n") < 3 and time.monotonic() < deadline:
             time.sleep(0.01)
