@@ -105,7 +105,7 @@ wheel: $(STAMP)
 	$(USE) export latest --format all
 	$(USE) runs
 	$(USE) new-task my_task.py
-	$(USE) check-env --config my_task.yaml
+	$(USE) check-env my_task.yaml
 	$(USE) train obstacle --run-dir runs/obstacle --set ppo.num_timesteps=131_072
 	.cache/wheel/venv/bin/python -m pytest -p no:cacheprovider --numprocesses 2 --dist loadfile \
 		tests/end_to_end/test_kernels_are_on.py tests/onekernel/test_lower_jaxpr.py tests/viewers/test_viser_server.py
