@@ -25,12 +25,8 @@ def _parser() -> cli.Parser:
     seed = "random seed, the same as --set seed=N"
     cli.add_count(parser, "--seed", seed, least=0, most=2**32 - 1)
     cli.add_count(parser, "--seeds", "train N policies at once, the same as --set seeds=N")
-    parser.add_argument(
-        "--init-from",
-        metavar="RUN",
-        help="start from the policy of another run, of any task; it explores anew, so that it does"
-        " worse at first than in that run",
-    )
+    text = "start from the policy of another run, of any task; it explores anew: worse at first"
+    parser.add_argument("--init-from", metavar="RUN", help=text)
     parser.add_argument(
         "--run-dir", type=Path, help="run folder (default: runs/<config>-<date>-<time>)"
     )

@@ -171,8 +171,7 @@ def _lines(stream: TextIO) -> _Display:
         def advance(count: int) -> None:
             nonlocal done, first
             done += count
-            if first is None:
-                first = done, time.monotonic()
+            first = first or (done, time.monotonic())
             if total and done < total:
                 say_how_far()
 
@@ -183,10 +182,8 @@ def _lines(stream: TextIO) -> _Display:
                 return
             last_line = now
             counted = "" if total is None else f" {done:,} of {total:,},"
-            # What came first has compiled, too, and says nothing about the rest.
             if total and first and done > first[0]:
-                left = (now - first[1]) * (total - done) / (done - first[0])
-                say(f"{name}:{counted} about {left:.0f} s left")
+                say(f"{name}:{counted} about {_seconds_left(first, now, done, total):.0f} s left")
             else:
                 say(f"{name}:{counted} {now - began:.0f} s so far")
 
@@ -199,3 +196,17 @@ def _lines(stream: TextIO) -> _Display:
             under_way.remove(finished)
 
     return show
+
+
+def _seconds_left(first: tuple[int, float], now: float, done: int, total: int) -> float:
+    """Return how long a stage will still take, at the speed since its first report.
+
+    What came before that has compiled, too, and says nothing about the rest.
+
+    Args:
+      first: how many units the first report told, and when [s].
+      now: the time [s].
+      done: units that are done, more than the first report told.
+      total: all units.
+    """
+    return (now - first[1]) * (total - done) / (done - first[0])
