@@ -56,8 +56,10 @@ def check_size(size: tuple[int, int]) -> None:
     Raises:
       InvalidError: They are not even numbers from 64 to 4096.
     """
-    if len(size) != 2 or any(side % 2 or not 64 <= side <= 4096 for side in size):
-        told = "x".join(map(str, size))
+    sides = size if isinstance(size, list | tuple) else (size,)
+    whole = all(isinstance(side, numbers.Integral) for side in sides)
+    if len(sides) != 2 or not whole or any(x % 2 or not 64 <= x <= 4096 for x in sides):
+        told = "x".join(map(str, sides))
         raise InvalidError(
             f"size = {told} is wrong: it should be two even numbers from 64 to 4096, as in 1280x720"
         )

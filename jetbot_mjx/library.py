@@ -8,7 +8,7 @@ settings as they are. They work in a notebook and in any thread.
 import contextlib
 import functools
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack, overload
 
@@ -161,6 +161,11 @@ def evaluate(
     }
     with _ready(verbose, trust):
         if not isinstance(runs, str | Path):
+            if not isinstance(runs, Iterable):
+                raise InvalidError(f"runs = {runs!r} is wrong: name a run, or several in a list")
+            runs = list(runs)
+            if not runs:
+                raise InvalidError("runs = [] is empty: name at least one run")
             return evaluation.compare_runs([find_run(run) for run in runs], **options)
         run = find_run(runs)
         if seed_folders(run):

@@ -56,7 +56,7 @@ def load_config(
         raise ConfigError(
             f"config = {shown(config)} is wrong: it should be a name, a file or Config"
         )
-    if isinstance(overrides, str):
+    if not _are_settings(overrides):
         raise ConfigError(
             f"overrides = {shown(overrides)} is wrong: give settings and values, as in"
             " {'ppo.num_envs': 256}"
@@ -169,6 +169,13 @@ def parse_config(values: Mapping[str, object], source: str = "config") -> Config
         from jetbot_mjx.config.explain import explain
 
         raise ConfigError(f"{source}: {explain(error.errors()[0])}") from None
+
+
+def _are_settings(overrides: Overrides) -> bool:
+    """Return whether overrides are a mapping, or a list of texts, and not a text themselves."""
+    if isinstance(overrides, Mapping | str):
+        return isinstance(overrides, Mapping)
+    return all(isinstance(override, str) for override in overrides)
 
 
 def _apply_override(values: dict[str, object], override: str, source: str) -> None:

@@ -234,6 +234,8 @@ class _CheckedPolicy:
         size, layout = (self._checkpoint.about[name] for name in ("observation_size", "layout"))
         if isinstance(size, int):
             _check_numbers(obs, size, layout)
+            # A list of numbers is an observation, too.
+            obs = np.asarray(obs, np.float32) if isinstance(obs, list | tuple) else obs
         else:
             _check_parts(obs, size)
         return self._policy(obs, key)

@@ -19,13 +19,13 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import numpy as np
 
 from jetbot_mjx.config import Config, ConfigError, Setting
-from jetbot_mjx.errors import UserError, ran_out, requires_extra
+from jetbot_mjx.errors import InvalidError, UserError, ran_out, requires_extra
 from jetbot_mjx.evaluation import REPORT_GOALS, report_keys
 from jetbot_mjx.runs import load_checkpoint, make_folder
 from jetbot_mjx.terminal import stage
@@ -668,8 +668,12 @@ def _check_config(config: Config, objective: Objective) -> None:
 
     Raises:
       ConfigError: a setting is not one of trials.
+      InvalidError: there is no such objective.
       UserError: `init_from` is not a run.
     """
+    if objective not in get_args(Objective):
+        choices = ", ".join(map(repr, get_args(Objective)))
+        raise InvalidError(f"objective = {objective!r} is wrong: choose one of {choices}")
     if config.trainer != "resumable":
         raise ConfigError(
             f"trainer = {config.trainer!r} cannot be tuned: take trainer = 'resumable'"

@@ -107,7 +107,7 @@ def render_run(
     if episodes is not None:
         check_count("episodes", episodes, evaluation.REPORT_GOALS)
     if goals is not None:
-        evaluation.check_goals(goals)
+        goals = evaluation.check_goals(goals)
     checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
     if checkpoint.config.environment is not None:
         return _render_environment(checkpoint, episodes or _ENVIRONMENT_EPISODES, goals, size)

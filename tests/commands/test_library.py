@@ -14,6 +14,7 @@ import warnings
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 
 import jetbot_mjx
@@ -257,11 +258,19 @@ def test_a_default_is_that_of_the_commands():
         (lambda run: evaluate("nowhere"), NotFoundError, "no checkpoint at"),
         (lambda run: evaluate(run, episodes=0), InvalidError, "episodes = 0 is wrong: it should"),
         (lambda run: evaluate(run, episodes=2.5), InvalidError, "episodes = 2.5 is wrong: it"),
+        (lambda run: evaluate([]), InvalidError, "runs = [] is empty: name at least one run"),
+        (lambda run: evaluate(None), InvalidError, "runs = None is wrong: name a run, or several"),
         (lambda run: evaluate(run, simulator="gym"), InvalidError, "simulator = 'gym' is unknown"),
         (lambda run: render("nowhere"), NotFoundError, "no checkpoint at"),
         (lambda run: render(run, size=(640, 361)), InvalidError, "size = 640x361 is wrong: it"),
         (lambda run: render(run, episodes=0), InvalidError, "episodes = 0 is wrong: it should be"),
         (lambda run: render(run, goals=["3"]), InvalidError, "goals: '3' is wrong: give indices"),
+        (lambda run: render(run, goals=3), InvalidError, "goals = 3 is wrong: give indices"),
+        (lambda run: render(run, goals=[]), InvalidError, "goals = [] is empty: give at least on"),
+        (lambda run: render(run, goals=[3, 3]), InvalidError, "goal 3 is given twice"),
+        (lambda run: render(run, goals=np.array([5000])), InvalidError, "goal 5000 is not one of"),
+        (lambda run: render(run, size=64), InvalidError, "size = 64 is wrong: it should be two"),
+        (lambda run: render(run, size=(64.0, 64)), InvalidError, "size = 64.0x64 is wrong: it sho"),
         (lambda run: render(run, many=0), InvalidError, "robots = 0 is wrong: it should be a wh"),
         (lambda run: render(run, gallery=True, goals=[1]), InvalidError, "gallery and goals exc"),
         (lambda run: render(run, gallery=True, strip=True), InvalidError, "strip and gallery exc"),
@@ -269,6 +278,16 @@ def test_a_default_is_that_of_the_commands():
         (lambda run: render(run, goals=[1], episodes=2), InvalidError, "goals and episodes excl"),
         (lambda run: render(run, many=4, episodes=2), InvalidError, "many and episodes exclude"),
         (lambda run: tune("smoke", space={}), InvalidError, "space is empty: write lines such as"),
+        (
+            lambda run: tune("smoke", space="ppo", objective="sucess"),
+            InvalidError,
+            "objective = 'sucess' is wrong: choose one of 'learning', 'time'",
+        ),
+        (
+            lambda run: load_config("smoke", [("seed", 1)]),
+            InvalidError,
+            "overrides = [('seed', 1)] is wrong: give",
+        ),
         (lambda run: tune("smoke", space="no.yaml"), NotFoundError, "no.yaml does not exist"),
         (lambda run: tune("smoke", space={"seed": {}}, trials=0), InvalidError, "trials = 0 is w"),
         (lambda run: make_env("jetbo"), NotFoundError, "did you mean jetbot?"),

@@ -134,6 +134,11 @@ def test_a_policy_is_deterministic_without_a_key_and_samples_with_one(smoke_run)
     assert np.all(np.abs(policy(100.0 * batched)) <= 1.0)
 
 
+def test_a_list_of_numbers_is_an_observation(smoke_run):
+    policy = load_policy(smoke_run)
+    np.testing.assert_array_equal(policy([0.1] * 7), policy(np.full(7, 0.1, np.float32)))
+
+
 @pytest.mark.parametrize(
     ("obs", "got"),
     [
