@@ -11,7 +11,7 @@ from onekernel.mujoco import fuse_mjx
 SOONEST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 """Options with which XLA compiles soonest for a CPU."""
 
-DIFFERENCE = 1e-5
+DIFFERENCE = 1e-6
 """Of the finite differences, in the unit of an argument."""
 
 

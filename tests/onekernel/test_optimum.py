@@ -66,7 +66,8 @@ def of_gymnasium(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", GYMNASIUM)
 def test_a_model_of_gymnasium_has_the_derivatives_of_differences(name):
-    check(functools.partial(of_gymnasium, name), forces=False)
+    # The gradient of an ant has more operations than one kernel may have.
+    check(functools.partial(of_gymnasium, name), forces=False, kernel=name != "ant")
 
 
 @pytest.mark.slow
