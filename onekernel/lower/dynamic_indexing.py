@@ -384,11 +384,12 @@ def _is_before(graph: ExprGraph, a: Sequence[Scalar], b: Sequence[Scalar]) -> Sc
 
 
 def _top_k(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> list[ScalarArray]:
-    """Sort the last axis from the largest number to the smallest, and keep the first ones.
+    """Sort an axis from the largest number to the smallest, and keep the first ones.
 
     As in XLA, -0 is below 0, and NaN is above or below all numbers, by its sign.
     """
-    count = equation.params["k"]
+    count, axis = equation.params["k"], equation.params["axis"]
+    x = np.moveaxis(x, axis, -1)
     kind = dtype_of(equation.outvars[1]).type
     found = []
     for numbers in x.reshape(math.prod(x.shape[:-1]), x.shape[-1]):
@@ -397,7 +398,7 @@ def _top_k(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> list[ScalarA
         rows = _in_order(graph, rows, lambda a, b: graph.apply("lt", a[0], b[0]))
         found += rows[:count]
     shape = (*x.shape[:-1], count)
-    return [scalar_array((row[i] for row in found), shape) for i in (1, 2)]
+    return [np.moveaxis(scalar_array((row[i] for row in found), shape), -1, axis) for i in (1, 2)]
 
 
 def _rank(graph: ExprGraph, x: Scalar) -> Scalar:

@@ -81,8 +81,14 @@ def fill_value(equation: JaxprEqn) -> float:
     return np.nan if dtype.kind == "f" else np.iinfo(dtype).min if dtype.kind == "i" else True
 
 
-def _reshape(equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+def _with_shape(equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
     return x.reshape(shape_of(equation.outvars[0]))
+
+
+def _reshape(equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+    # It may read the axes in another order: `vmap` makes such ones.
+    order = equation.params["dimensions"]
+    return _with_shape(equation, x if order is None else x.transpose(order))
 
 
 def _slice(equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
@@ -148,7 +154,7 @@ RULES: dict[str, Rule] = {
     "device_put": lambda equation, *xs: list(xs),
     "empty": _empty,
     "empty2": _empty,
-    "expand_dims": _reshape,
+    "expand_dims": _with_shape,
     "iota": _iota,
     # What `jax.checkpoint` may store has a name.
     "name": lambda equation, x: x,
@@ -162,7 +168,7 @@ RULES: dict[str, Rule] = {
     "split": lambda equation, x: np.split(
         x, np.cumsum(equation.params["sizes"])[:-1], equation.params["axis"]
     ),
-    "squeeze": _reshape,
+    "squeeze": _with_shape,
     "stack": lambda equation, *xs: np.stack(xs, equation.params["axis"]),
     "stop_gradient": lambda equation, x: x,
     "tile": lambda equation, x: np.tile(x, equation.params["reps"]),

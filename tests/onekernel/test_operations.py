@@ -231,6 +231,18 @@ IMAGES = {
     "groups of images": lambda x: filtered(x, 4, 2, batch_group_count=2),
 }
 
+AXES = {
+    "reshaped in another order": lambda x: jax.lax.reshape(x, (4, 6), dimensions=(2, 0, 1)),
+    "largest": lambda x: [jax.lax.top_k(x, 2, axis=axis) for axis in range(3)],
+    "sorted": lambda x: [jax.lax.sort((jnp.round(x), x), dimension=0, num_keys=k) for k in (1, 2)],
+    "cumulated": lambda x: [jax.lax.cumsum(x, axis=1, reverse=way) for way in (False, True)],
+    "in the middle": lambda x: [jnp.median(x, axis=1), jnp.argmax(x, axis=1), jnp.var(x, axis=1)],
+    "repeated": lambda x: [jnp.repeat(x, 2, axis=1), jnp.tile(x, (2, 1, 3)), jnp.roll(x, 1, 2)],
+    "products": lambda x: jnp.einsum("abc,dbc->ad", x, x),
+    "product's derivative": jax.vmap(jax.grad(lambda x: jnp.prod(1 + x)), in_axes=1),
+    "mapped twice": jax.vmap(jax.vmap(lambda x: jax.lax.top_k(x, 2), 1, 1), 2, 0),
+}
+
 DERIVATIVES = {
     "gradient": jax.grad(lambda x: jnp.sum(jnp.sin(x) ** 2 * x)),
     "second": jax.hessian(lambda x: jnp.sum(x**3) * x[0]),
@@ -265,6 +277,7 @@ GROUPS = {
     "matrices": (MATRICES, [conditioned(4)]),
     "derivatives": (DERIVATIVES, [floats(6)]),
     "images": (IMAGES, [floats(40)]),
+    "axes": (AXES, [floats(3, 4, 2)]),
 }
 
 
