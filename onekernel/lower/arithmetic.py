@@ -5,6 +5,7 @@ A rule is a function of the graph, the equation and its operands, one array of s
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -33,7 +34,7 @@ from onekernel.lower.scalar_ir import (
 )
 
 MIN_BRANCH_PRODUCTS = 9
-"""Fewest products in a matrix product's term that a branch skips."""
+"""Fewest products of a matrix product that a branch skips."""
 
 _WORD, _LONG = np.dtype(np.uint32), np.dtype(np.uint64)
 
@@ -256,31 +257,27 @@ def _sums(graph: ExprGraph, rows: _Vectors, columns: _Vectors, zero: Scalar) -> 
 def _sums_of_terms(
     graph: ExprGraph, rows: _Vectors, columns: _Vectors, zero: Scalar
 ) -> list[Scalar]:
-    """Return the same sums; a branch around the i-th terms of all skips them where they are 0."""
+    """Return the same sums; branches skip the terms where a truth value in them is false."""
     totals = [zero] * (len(rows) * len(columns))
-    count = len(rows[0]) if totals else 0
-    for i in range(count):
-        left, right = ([vector[i] for vector in side] for side in (rows, columns))
-        products = [graph.apply("mul", x, y) for x, y in itertools.product(left, right)]
-        added = [graph.apply("add", *pair) for pair in zip(totals, products, strict=True)]
-        condition = _condition_of(left, right)
-        totals = added if condition is None else graph.branch(condition, totals, added)
+    # The i-th numbers of all rows, and of all columns; there may be no rows or columns.
+    terms = list(zip(zip(*rows, strict=True), zip(*columns, strict=True), strict=False))
+    conditions = [_condition_of(left) or _condition_of(right) for left, right in terms]
+    # One branch is around successive terms with the same truth value, such as those of a contact.
+    for condition, places in itertools.groupby(range(len(terms)), conditions.__getitem__):
+        added, count = totals, 0
+        for i in places:
+            products = [graph.apply("mul", x, y) for x, y in itertools.product(*terms[i])]
+            added = [graph.apply("add", *pair) for pair in zip(added, products, strict=True)]
+            count += math.prod(sum(not equals(x, 0) for x in side) for side in terms[i])
+        is_worth_it = condition is not None and count >= MIN_BRANCH_PRODUCTS
+        totals = graph.branch(condition, totals, added) if is_worth_it else added
     return totals
 
 
-def _condition_of(left: Sequence[Scalar], right: Sequence[Scalar]) -> Expr | None:
-    """Return a truth value that is a factor of all products of two vectors' numbers.
-
-    None: there is none, or too few products to be worth a branch.
-    """
-    factors, others = ([x for x in side if not equals(x, 0)] for side in (left, right))
-    if len(factors) * len(others) < MIN_BRANCH_PRODUCTS:
-        return None
-    for side in (factors, others):
-        conditions = {_truth_in(x) for x in side}
-        if len(conditions) == 1:
-            return conditions.pop()
-    return None
+def _condition_of(vector: Sequence[Scalar]) -> Expr | None:
+    """Return a truth value that is a factor of all numbers of a vector; None: there is none."""
+    conditions = {_truth_in(x) for x in vector if not equals(x, 0)}
+    return conditions.pop() if len(conditions) == 1 else None
 
 
 def _truth_in(x: Scalar) -> Expr | None:

@@ -754,6 +754,19 @@ def test_what_is_multiplied_by_false_is_skipped(function):
     assert len(placed(skipping, PlacedBranch)) >= 6
 
 
+def test_successive_rows_with_one_truth_value_share_a_branch():
+    def forces(rows, x):
+        active = jnp.repeat(rows[::3] @ x < 0, 3)
+        return (rows.T * active) @ jnp.ones(len(rows))
+
+    program = jaxpr.scalarize(forces, *ROWS, skips=True)
+    assert len(placed(program, PlacedBranch)) == 2
+    rows = np.float32(np.random.default_rng(0).normal(size=(20, 6, 4)))
+    points = np.ones((20, 4), np.float32)
+    plain = evaluate(jaxpr.scalarize(forces, *ROWS), [rows, points])[0]
+    np.testing.assert_array_equal(evaluate(program, [rows, points])[0], plain)
+
+
 def test_a_loop_does_not_carry_what_branches_make_of_what_it_carries():
     # The matrix follows from x: it is made where an iteration begins, and not before the loop too.
     for skips in (False, True):
