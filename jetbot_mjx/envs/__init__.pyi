@@ -42,7 +42,6 @@ from .opengl import some_without_gpu as some_without_gpu
 from .own_class import import_class as import_class
 from .program_key import is_built_in as is_built_in
 from .program_key import open_program_cache as open_program_cache
-from .program_key import own_fingerprint as own_fingerprint
 from .robot_facts import describe_robot as describe_robot
 from .robot_facts import step_rate as step_rate
 from .robot_facts import training_hints as training_hints

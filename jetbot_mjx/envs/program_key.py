@@ -52,27 +52,29 @@ def is_built_in(task: str) -> bool:
 
 
 def open_program_cache(
-    config: Config, *, keep: bool = True, own: str | None = None
+    config: Config, *, keep: bool = True, own: "JetBotEnv | AdaptedEnv | None" = None
 ) -> onekernel.ProgramCache:
     """Open the cache of a configuration's programs.
 
     Args:
       config: the configuration of the run.
       keep: whether to keep the programs in JAX's folder of compiled programs.
-      own: a hash of the environment or task of one's own that the configuration names.
+      own: the environment, unwrapped, if it or its task is of one's own.
 
     Returns:
-      The cache. It is in memory anyway if there is no such folder, for code of one's own without a
-      hash, and if several processes train together.
+      The cache. It is in memory anyway if there is no such folder, for code of one's own that is
+      not given or has no hash, and if several processes train together.
     """
     folder = jax.config.values["jax_compilation_cache_dir"]
-    known = own is not None or is_built_in(config.code)
+    hashed = None if own is None else own_fingerprint(own)
+    known = hashed is not None or is_built_in(config.code)
     kept = keep and folder and known and jax.process_count() == 1
     return onekernel.ProgramCache(
         compiler_options(config.deterministic),
         Path(folder) if kept else None,
-        _key(config, own) if kept else "",
+        _key(config, hashed) if kept else "",
         fallbacks,
+        _own_nodes(own) if kept else (),
     )
 
 
@@ -126,8 +128,29 @@ def own_fingerprint(env: "JetBotEnv | AdaptedEnv") -> str | None:
         return fingerprint(*env.traced)
     task = env.task
     methods = jax.make_jaxpr(call_methods(task))(TaskProbe(task, env.config).example)
-    found = fingerprint(methods, jax.make_jaxpr(task.sample)(first_key()))
-    return found and f"{found} {task.layout} {_model_hash(env.physics.mj_model)}"
+    sample, goal = jax.make_jaxpr(task.sample, return_shape=True)(first_key())
+    found = fingerprint(methods, sample)
+    # Arguments and results of the programs are stored with the structure of the goal, which a trace
+    # does not tell.
+    structure = jax.tree.structure(goal)
+    return found and f"{found} {structure} {task.layout} {_model_hash(env.physics.mj_model)}"
+
+
+def _own_nodes(env: "JetBotEnv | AdaptedEnv | None") -> list[type]:
+    """Return the classes that a task's goal consists of; none for an environment of one's own."""
+    from jetbot_mjx.envs.adapted_env import AdaptedEnv
+    from jetbot_mjx.envs.checks.probe import first_key
+
+    if env is None or isinstance(env, AdaptedEnv):
+        return []
+    found = []
+    trees = [jax.tree.structure(jax.eval_shape(env.task.sample, first_key()))]
+    while trees:
+        tree = trees.pop()
+        if node := tree.node_data():
+            found.append(node[0])
+            trees += tree.children()
+    return found
 
 
 def _model_hash(model: "mujoco.MjModel") -> str:

@@ -75,7 +75,7 @@ def compose(
         envs.require_trainable(setup.env.task, config)
     if keep and not envs.is_built_in(config.code):
         # Only now it is known what the programs depend on.
-        setup.programs = envs.open_program_cache(config, own=envs.own_fingerprint(setup.env))
+        setup.programs = envs.open_program_cache(config, own=setup.env)
     if isinstance(setup.env, AdaptedEnv) and not setup.programs.has("advance"):
         # What was trained before has passed it.
         envs.require_sound(setup.env)

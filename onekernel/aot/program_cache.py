@@ -7,11 +7,13 @@ its user computes from everything that the program depends on.
 
 import contextlib
 import hashlib
+import io
 import pickle
 import platform
 import threading
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
@@ -88,6 +90,7 @@ class ProgramCache:
         folder: Path | None = None,
         key: str = "",
         notices: Notices | None = None,
+        nodes: Sequence[type] = (),
     ) -> None:
         """Set the options, folder and key of the cache.
 
@@ -97,12 +100,16 @@ class ProgramCache:
           key: everything that the programs depend on, but for the options and the processor.
           notices: collects notices to users; those from the tracing of a program are stored with
             it, and reported again where it is loaded.
+          nodes: classes in the pytrees that programs take and return, of modules that a later
+            process may not find by their names; in an order that the key decides. Files hold their
+            numbers, and a program that is loaded has the classes given here.
         """
         self.options = options
         """The compiler options of the programs."""
         self._folder = folder
         self._key = f"{key} {processor()} {sorted(options.items())}" if folder else ""
         self._notices = notices or _NoNotices()
+        self._nodes = nodes
         self._prefetched: dict[str, Future[_Stored | None]] = {}
         self.loads = False
         """Whether programs are being loaded, and not one of them must be compiled."""
@@ -114,7 +121,7 @@ class ProgramCache:
         for name in names:
             # Each program has a thread of its own, so that all load at the same time.
             pool = ThreadPoolExecutor(1)
-            self._prefetched[name] = pool.submit(_load, self._path(name))
+            self._prefetched[name] = pool.submit(_load, self._path(name), self._nodes)
             pool.shutdown(wait=False)
         self.loads = all(self._path(name).exists() for name in names)
 
@@ -135,7 +142,7 @@ class ProgramCache:
             return None
         # A program is loaded once: wait for the thread that loads it, or load it now.
         prefetched = self._prefetched.pop(name, None)
-        stored = prefetched.result() if prefetched else _load(self._path(name))
+        stored = prefetched.result() if prefetched else _load(self._path(name), self._nodes)
         if stored is None:
             return None
         # A cached program is not traced, so repeat the notices of its tracing.
@@ -248,7 +255,8 @@ class ProgramCache:
             # text takes a while; a program for a GPU contains its PTX.
             text = lowered.program.as_text() if jax.default_backend() == "cpu" else ""
             kernels = cpu.kernels_in(text)
-            _save(self._path(name), _Stored(program, lowered.notices), kernels, seconds)
+            stored = _Stored(program, lowered.notices)
+            _save(self._path(name), stored, kernels, seconds, self._nodes)
         return program
 
     def _path(self, name: str) -> Path:
@@ -320,15 +328,46 @@ def _compiled(lowered: jax.stages.Lowered, options: Options) -> tuple[jax.stages
     return program, (events.hits > 0 or reused) and jax.default_backend() == "cpu"
 
 
-def _load(path: Path) -> _Stored | None:
-    """Load the program in a file; return None if it is missing, damaged, untrusted or unusable."""
+class _Pickler(pickle.Pickler):
+    """A `_Pickler` writes classes of the cache's user as numbers."""
+
+    def __init__(self, file: io.BytesIO, nodes: Sequence[type]) -> None:
+        super().__init__(file)
+        self._nodes = nodes
+
+    def persistent_id(self, obj: object) -> int | None:
+        found = (number for number, node in enumerate(self._nodes) if node is obj)
+        return next(found, None)
+
+
+class _Unpickler(pickle.Unpickler):
+    """An `_Unpickler` reads what a `_Pickler` wrote."""
+
+    def __init__(self, file: io.BytesIO, nodes: Sequence[type]) -> None:
+        super().__init__(file)
+        self._nodes = nodes
+
+    def persistent_load(self, pid: int) -> type:
+        return self._nodes[pid]
+
+
+def _load(path: Path, nodes: Sequence[type]) -> _Stored | None:
+    """Load the program in a file; return None if it is missing, damaged, untrusted or unusable.
+
+    What cannot be unpickled costs a warning.
+    """
     began = time.perf_counter()
     content = read_trusted(path)
     if content is None:
         return None
     # `read_trusted` has checked that nobody else can have written this pickle. Register the kernels
     # first: XLA looks for them when it loads the program.
-    seconds, kernels, notices, ids, serialized = pickle.loads(content)
+    try:
+        seconds, kernels, notices, ids, serialized = _Unpickler(io.BytesIO(content), nodes).load()
+    except Exception as error:
+        # What a pickle names may be anyone's code, and raise anything.
+        _warn("read, and is compiled again", error)
+        return None
     cpu.register(kernels)
     # Programs name their devices by number.
     devices = {device.id: device for device in jax.devices()}
@@ -354,10 +393,23 @@ def _load(path: Path) -> _Stored | None:
     return _Stored(program, notices)
 
 
-def _save(path: Path, stored: _Stored, kernels: dict[str, bytes], seconds: float) -> None:
+def _warn(what: str, error: Exception) -> None:
+    """Say in one line what cannot be done with a compiled program, once for each reason."""
+    reason = f"{type(error).__name__}: {error}".splitlines()[0]
+    warnings.warn(f"a compiled program cannot be {what}: {reason}", stacklevel=1)
+
+
+def _save(
+    path: Path,
+    stored: _Stored,
+    kernels: dict[str, bytes],
+    seconds: float,
+    nodes: Sequence[type],
+) -> None:
     """Write a program, the kernels that it calls and its compile time to a file.
 
-    An error while writing is ignored, because a missing file only costs time.
+    An error while writing is ignored, because a missing file only costs time. What cannot be
+    pickled costs a warning, because every process compiles it again.
     """
     try:
         serialized = serialize_executable.serialize(stored.program)
@@ -367,10 +419,16 @@ def _save(path: Path, stored: _Stored, kernels: dict[str, bytes], seconds: float
     except (NotImplementedError, ValueError):
         # Devices of this kind cannot serialize programs.
         return
-    content = pickle.dumps((seconds, kernels, stored.notices, ids, serialized))
+    file = io.BytesIO()
+    try:
+        _Pickler(file, nodes).dump((seconds, kernels, stored.notices, ids, serialized))
+    except Exception as error:
+        # For example, a class in its results belongs to a module that cannot be imported.
+        _warn("kept, and is compiled again by every start", error)
+        return
     with contextlib.suppress(OSError):
         # Remove programs that nobody has loaded for a month (`_load` touches what it loads).
         for other in path.parent.glob("program-*"):
             if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:
                 other.unlink(missing_ok=True)
-        write_private(path, content)
+        write_private(path, file.getvalue())

@@ -1,5 +1,6 @@
 """Compiled programs that outlive their process: found without tracing, by their own key only."""
 
+import functools
 import os
 import shutil
 import subprocess
@@ -8,6 +9,8 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +23,12 @@ import onekernel
 from helpers import gliding
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs import program_key, robot_model
+from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.envs.task import GoalTask, make_task
-from jetbot_mjx.runs import Setup
+from jetbot_mjx.runs import Setup, task_code
 from jetbot_mjx.runs.checkpoint import PRETRAINED
+from jetbot_mjx.runs.task_code import TaskCode, read_task_code, stored_class, write_task_code
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer, build_ppo
 from onekernel.aot import program_cache
 from onekernel.aot.program_cache import ProgramCache
@@ -192,6 +197,53 @@ def test_a_folder_that_cannot_be_written_costs_nothing_but_time(folder):
     assert not list(folder.iterdir())
 
 
+PAIR = """
+from typing import NamedTuple, Any
+
+class Pair(NamedTuple):
+    one: Any
+    other: Any
+"""
+
+
+def pair_of_a_module_that_cannot_be_imported():
+    space: dict[str, Any] = {"__name__": "nowhere_to_be_found"}
+    exec(PAIR, space)
+    return space["Pair"]
+
+
+def paired(pair):
+    return lambda: jax.jit(lambda x: pair(x, 2 * x)).trace(jnp.ones(3))
+
+
+def test_a_program_has_the_classes_of_the_process_that_loads_it(folder):
+    first, second = (pair_of_a_module_that_cannot_be_imported() for _ in range(2))
+    ProgramCache({}, folder, KEY, nodes=[first]).compile("paired", paired(first))
+    program = ProgramCache({}, folder, KEY, nodes=[second]).compile("paired", never)
+    result = program(jnp.ones(3))
+    assert type(result) is second
+    assert result.other.tolist() == [2, 2, 2]
+
+
+def test_a_class_that_cannot_be_imported_costs_a_line_and_no_training(folder, monkeypatch):
+    pair = pair_of_a_module_that_cannot_be_imported()
+    cache = ProgramCache({}, folder, KEY)
+    with pytest.warns(UserWarning, match="cannot be kept.*nowhere_to_be_found"):
+        program = cache.compile("paired", paired(pair))
+    assert program(jnp.ones(3)).other.tolist() == [2, 2, 2]
+    assert not list(folder.glob("program-*"))
+    # A file that another process wrote, which finds the module.
+    module = ModuleType("nowhere_to_be_found")
+    module.__dict__["Pair"] = pair
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, module.__name__, module)
+        cache.compile("paired", paired(pair))
+    again = ProgramCache({}, folder, KEY)
+    for find in (again.find, lambda name: again.prefetch(name) or again.find(name)):
+        with pytest.warns(UserWarning, match="cannot be read.*nowhere_to_be_found"):
+            assert find("paired") is None
+
+
 def test_without_a_folder_nothing_is_kept(folder):
     assert twice(ProgramCache({}).compile("double", double)) == [0.0, 2.0, 4.0]
     assert ProgramCache({}).find("double") is None
@@ -339,6 +391,65 @@ def test_another_model_is_another_program(paths, monkeypatch):
 )
 def test_a_task_of_someone_else_is_always_traced(paths, name):
     assert paths({"task": {"name": name}}) is None
+
+
+CHASE = """
+from dataclasses import dataclass, field
+from typing import Any
+from jax.tree_util import register_dataclass
+from jetbot_mjx.envs.task import GoalTask
+
+@register_dataclass
+@dataclass
+class Chased:
+    goal_w: Any
+    animal: str = field(default="hare", metadata={"static": True})
+
+class Chase(GoalTask):
+    def sample(self, key):
+        return Chased(super().sample(key))
+
+    def goal_position(self, goal):
+        return goal.goal_w
+"""
+
+
+@pytest.fixture
+def chasing(tmp_path, monkeypatch):
+    """The environment of a task whose source a run has stored, under one name."""
+
+    def chasing(source, name):
+        run = tmp_path / name
+        run.mkdir()
+        write_task_code(run, TaskCode("chase", (("chase.py", source.encode()),)))
+        monkeypatch.setattr(task_code, "_modules", {})  # as in another process
+        config = parse_config({"task": {"name": "chase:Chase"}})
+        code = read_task_code(run)
+        assert code is not None
+        own_class = stored_class(run, config.code, code, silent=True)
+        return make_env(config, own_class=own_class)
+
+    return chasing
+
+
+def test_a_stored_task_finds_its_programs_and_no_other_task_of_its_name_does(
+    paths, chasing, folder
+):
+    farther = CHASE.replace("super().sample(key)", "2 * super().sample(key)")
+    # Nothing computes with these: only the structure of the goal tells of them.
+    others = CHASE.replace("hare", "fox"), CHASE.replace("Chased", "Hunted")
+    sources = [CHASE, CHASE, farther, *others]
+    envs = [chasing(source, f"run-{number}") for number, source in enumerate(sources)]
+    caches = [open_program_cache(env.config, own=env) for env in envs]
+    key = jax.random.PRNGKey(0)
+    for env, cache in zip(envs, caches, strict=True):
+        found = cache.find("sample")
+        assert (found is not None) == (env is envs[1])
+        program = cache.compile("sample", functools.partial(jax.jit(env.task.sample).trace, key))
+        assert jax.tree.structure(program(key)) == jax.tree.structure(env.task.sample(key))
+        assert type(program(key)).__module__ == "chase"
+    assert len({cache._path("sample") for cache in caches}) == 4
+    assert "chase" not in sys.modules
 
 
 def test_the_packages_own_tasks_are_named_by_the_package_alone(paths, own_tasks):
