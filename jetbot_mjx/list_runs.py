@@ -5,6 +5,7 @@ in, and `--delete NAME` removes one after a question. The success rate is that o
 evaluation during the training; `jetbot-mjx evaluate` measures it with more goals.
 """
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ def _parser() -> cli.Parser:
     text = "list only runs whose name or task contains this text"
     parser.add_argument("--filter", metavar="TEXT", default="", help=text)
     cli.add_choice(parser, "--sort", _SORTS, "order of the list")
+    parser.set_defaults(sort=None)  # to tell whether it was given
     cli.add_flag(parser, "--json", "print the list as JSON")
     action = parser.add_mutually_exclusive_group()
     action.add_argument("--open", metavar="RUN", help="open the newest report of a run")
@@ -44,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.yes and not options.delete:
         parser.error("--yes: it belongs to --delete")
+    _refuse_both(parser, options)
     if options.folder and not options.folder.is_dir():
         parser.error(f"{options.folder} is not a folder")
     with startup.exit_on_interrupt():
@@ -60,9 +63,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     elif options.delete:
         _delete(options.delete, asks=not options.yes)
     else:
-        how = {"text": options.filter, "sort": options.sort, "as_json": options.json}
+        how = {"text": options.filter, "sort": options.sort or _SORTS[0], "as_json": options.json}
         cli.tell(list_runs(options.folder, **how))
     return 0
+
+
+def _refuse_both(parser: cli.Parser, options: argparse.Namespace) -> None:
+    """Refuse what narrows or shapes the list where a run is named: another one might be meant."""
+    action = next((one for one in ("open", "compare", "delete") if getattr(options, one)), None)
+    for name in ("filter", "sort", "json", "folder"):
+        if action and (given := getattr(options, name)):
+            what = given if name == "folder" else f"--{name}"
+            parser.error(f"{what}: it is for the list, and --{action} takes a run itself")
 
 
 def _delete(name: str, *, asks: bool) -> None:

@@ -133,12 +133,14 @@ def find_deletable(path: Path) -> RunInfo:
     """Return the run of the user in a folder.
 
     Raises:
-      UserError: there is no run in it, or one that comes with the package.
+      UserError: there is no run in it, or one that comes with the package; or it is a link.
     """
     if path.resolve().parent == PRETRAINED.resolve():
         raise UserError(f"--delete {path.name}: it comes with the package and stays")
     if not (path / CONFIG).is_file():
         raise NotFoundError(f"--delete {path}: there is no run in this folder")
+    if path.is_symlink():
+        raise UserError(f"--delete {path}: it is a link: name the folder, {path.resolve()}")
     return read_info(path)
 
 

@@ -145,6 +145,26 @@ def test_a_name_of_no_run_is_refused_as_such(runs, action):
         list_runs.main([*action, "old"])
 
 
+@pytest.mark.parametrize("action", [["--open", "latest"], ["--delete", "latest", "--yes"]])
+@pytest.mark.parametrize(
+    "given", [["--filter", "older"], ["--sort", "name"], ["--sort", "age"], ["--json"], ["runs"]]
+)
+def test_what_is_for_the_list_is_refused_beside_a_run(runs, action, given, capsys):
+    with pytest.raises(SystemExit) as left:
+        list_runs.main([*given, *action])
+    assert left.value.code == 2
+    said = f"error: {given[0]}: it is for the list, and {action[0]} takes a run itself"
+    assert said in capsys.readouterr().err
+    assert Path("runs/newer").is_dir()
+
+
+def test_a_link_to_a_run_is_not_deleted(runs):
+    Path("runs/link").symlink_to("older")
+    with pytest.raises(UserError, match="it is a link: name the folder, .*/runs/older$"):
+        list_runs.main(["--delete", "link", "--yes"])
+    assert Path("runs/older").is_dir()
+
+
 def test_yes_alone_is_refused(capsys):
     with pytest.raises(SystemExit) as left:
         list_runs.main(["--yes"])
