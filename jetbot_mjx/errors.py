@@ -50,6 +50,18 @@ def check_count(name: str, value: object, most: float = math.inf) -> None:
         raise InvalidError(f"{name} = {value} is wrong: it should be at most {most}")
 
 
+def check_path(name: str, value: object) -> None:
+    """Check that an argument is a text or a path, not empty, of characters that a name may have.
+
+    Raises:
+      InvalidError: It is not; the message begins with `name`.
+    """
+    text = os.fspath(value) if isinstance(value, os.PathLike) else value
+    if not isinstance(text, str) or not text or "\0" in text:
+        hint = ": give its run_dir" if hasattr(value, "run_dir") else ""
+        raise InvalidError(f"{name} = {shown(value)} is wrong: it should be a path or a name{hint}")
+
+
 def check_size(size: tuple[int, int]) -> None:
     """Check that the width and height of a video can be encoded [pixels].
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Unpack, overload
 from jetbot_mjx import deployment, evaluation, runs, training, tuning, viewers
 from jetbot_mjx.config import Config, Overrides, load_config
 from jetbot_mjx.devices import require_device
-from jetbot_mjx.errors import InvalidError, UserError, check_count, check_size, ran_out
+from jetbot_mjx.errors import InvalidError, UserError, check_count, check_path, check_size, ran_out
 from jetbot_mjx.runs import (
     check_resumed,
     claim_run_dir,
@@ -85,7 +85,7 @@ def train(
             )
     elif config is None:
         raise InvalidError('give a configuration, as in train("jetbot"), or a run to resume')
-    with _ready(verbose, trust):
+    with _ready(verbose, trust, run_dir=run_dir):
         restart_clock()
         if resume is not None:
             run_dir = find_run(resume)
@@ -148,8 +148,7 @@ def evaluate(
       `environment`. Both name the folder of their files.
 
     Raises:
-      UserError: a run or argument is wrong, the runs cannot be compared, or a folder cannot be
-        written.
+      UserError: a run or argument is wrong, runs cannot be compared, or a folder not be written.
     """
     options: evaluation.ReportOptions = {
         "which": which,
@@ -159,14 +158,16 @@ def evaluate(
         "ranges": ranges,
         "simulator": simulator,
     }
-    with _ready(verbose, trust):
+    with _ready(verbose, trust, output=output, ranges=ranges):
+        if isinstance(runs, bytes) or hasattr(runs, "run_dir"):  # a training's result is a tuple
+            check_path("runs", runs)
         if not isinstance(runs, str | Path):
             if not isinstance(runs, Iterable):
                 raise InvalidError(f"runs = {runs!r} is wrong: name a run, or several in a list")
-            runs = list(runs)
-            if not runs:
+            found = [find_run(run) for run in runs]
+            if not found:
                 raise InvalidError("runs = [] is empty: name at least one run")
-            return evaluation.compare_runs([find_run(run) for run in runs], **options)
+            return evaluation.compare_runs(found, **options)
         run = find_run(runs)
         if seed_folders(run):
             raise InvalidError(
@@ -286,7 +287,7 @@ def tune(
     base = load_config(config, overrides)
     parameters = tuning.read_space(space, base)
     name = Path(f"tune-{_name(config).stem}")
-    with _ready(verbose), claim_run_dir(output, name) as folder:
+    with _ready(verbose, output=output, storage=storage), claim_run_dir(output, name) as folder:
         return tuning.run_search(
             base,
             parameters,
@@ -302,16 +303,27 @@ def tune(
 
 def _name(config: str | Path | Config) -> Path:
     """Return the name of a configuration, as of its file."""
-    return Path("run") if isinstance(config, Config) else Path(config)
+    if isinstance(config, Config):
+        return Path("run")
+    check_path("config", config)
+    return Path(config)
 
 
 @contextlib.contextmanager
-def _ready(verbose: bool, trust: bool = False) -> Iterator[None]:
-    """Check that there is a device; show progress and trust runs inside the context if asked to.
+def _ready(verbose: bool, trust: bool = False, **paths: object) -> Iterator[None]:
+    """Check paths and device; show progress and trust runs inside the context if asked to.
+
+    Args:
+      verbose: whether to show the progress.
+      trust: whether to trust runs.
+      **paths: arguments that are paths, or None, by their names.
 
     Raises:
-      UserError: JAX has no usable device, or the device has too little memory.
+      UserError: an argument is no path, JAX has no usable device, or it has too little memory.
     """
+    for name, path in paths.items():
+        if path is not None:
+            check_path(name, path)
     require_device()
     with contextlib.ExitStack() as stack:
         stack.enter_context(trusting(trust))
@@ -344,6 +356,7 @@ def load_policy(run_or_checkpoint: str | Path, which: "Which" = "best") -> "Poli
     Raises:
       UserError: there is no usable policy.
     """
+    check_path("run_or_checkpoint", run_or_checkpoint)
     folder = Path(run_or_checkpoint)
     if (folder / "policy.json").is_file() and (folder / "policy.py").is_file():
         return deployment.read_exported(folder)

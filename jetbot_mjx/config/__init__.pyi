@@ -9,6 +9,7 @@ from .keys import keys_meant_by as keys_meant_by
 from .load import Overrides as Overrides
 from .load import load_config as load_config
 from .load import parse_config as parse_config
+from .load import plain as plain
 from .look_quantities import LookParams as LookParams
 from .physics import PhysicsConfig as PhysicsConfig
 from .ppo import NetworkConfig as NetworkConfig

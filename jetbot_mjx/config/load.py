@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -18,7 +19,7 @@ from jetbot_mjx.errors import clipped, shown
 
 Overrides = Mapping[str, object] | Sequence[str]
 """Settings that replace those of a configuration: `{"ppo.num_envs": 256}`, or a list of
-`section.key=value` as after `--set`."""
+`section.key=value` as after `--set`. Numbers and arrays of NumPy and JAX are taken as Python's."""
 
 
 def load_config(
@@ -64,7 +65,7 @@ def load_config(
     _forget_robot(values, overrides)
     if isinstance(overrides, Mapping):
         name += f" with {shown(dict(overrides))}" if overrides else ""
-        for key, value in overrides.items():
+        for key, value in zip(overrides, map(plain, overrides.values()), strict=True):
             _set(values, str(key), value, f"{clipped(str(key))} = {shown(value)}")
     else:
         for override in overrides:
@@ -81,6 +82,20 @@ def load_config(
     if file is not None and imports:
         find_task_beside(file, resolved.code.partition(":")[0])
     return resolved
+
+
+def plain(value: object) -> Any:
+    """Return a value in which numbers and arrays, of NumPy or JAX, are Python's.
+
+    Of a list only the items are converted, not what is in them.
+    """
+    if isinstance(value, list | tuple):
+        return [_from_array(one) for one in value]
+    return _from_array(value)
+
+
+def _from_array(value: Any) -> object:
+    return value.tolist() if hasattr(value, "tolist") and not isinstance(value, type) else value
 
 
 def _with_robot_of_file(values: Mapping[str, object]) -> Mapping[str, object]:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jetbot_mjx import agents
 from jetbot_mjx.agents import Networks, Policy, PolicyParams
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, plain
 from jetbot_mjx.devices import require_float32
 from jetbot_mjx.envs import AdaptedEnv, JetBotEnv, LayoutData, layout_data
 from jetbot_mjx.errors import InvalidError, UserError, os_errors, shown
@@ -324,7 +324,7 @@ def _find(path: Path, which: Which) -> Path:
     elif which == "best":
         # Prefer the later of equally good ones, because it was trained for longer.
         step = max(steps, key=lambda step: (checkpoint_store.stored_score(path, step), step))
-    elif not isinstance(which, int):
+    elif not isinstance(which := plain(which), int):
         raise InvalidError(f"which = {which!r} is neither best, last nor a number of steps")
     elif which in steps:
         step = which

@@ -20,6 +20,7 @@ from jetbot_mjx.errors import (
     NotFoundError,
     UnreadableError,
     UserError,
+    check_path,
     clipped,
     os_errors,
     printable,
@@ -115,8 +116,10 @@ def find_run(name: str | Path, root: Path = ROOT, say: Callable[[str], None] | N
     Raises:
       NotFoundError: there is no latest run, or none of this name comes with the package or is on
         the Hub.
+      InvalidError: it is neither a text nor a path.
       UserError: as for `download_run`.
     """
+    check_path("run", name)
     text = str(name)
     if text.startswith(hub.PREFIX):
         return hub.download_run(text, root / _HUB, say)

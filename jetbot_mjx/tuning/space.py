@@ -20,6 +20,7 @@ from jetbot_mjx.config import (
     ConfigError,
     find_config,
     parse_config,
+    plain,
     read_yaml,
 )
 from jetbot_mjx.errors import clipped, shown
@@ -132,6 +133,7 @@ def _parameter(name: object, entry: object, path: str, config: Config) -> Parame
         raise ConfigError(
             f"{where} = {shown(entry)} is wrong: write {{low: A, high: B}} or {{choices: [...]}}"
         )
+    entry = {key: plain(value) for key, value in entry.items()}
     for key in entry:
         if key not in _KEYS:
             # A configuration is nested, and a space is not.

@@ -290,6 +290,7 @@ def test_a_default_is_that_of_the_commands():
         ),
         (lambda run: tune("smoke", space="no.yaml"), NotFoundError, "no.yaml does not exist"),
         (lambda run: tune("smoke", space={"seed": {}}, trials=0), InvalidError, "trials = 0 is w"),
+        (lambda run: tune(None, space="ppo"), InvalidError, "config = None is wrong: it should be"),
         (lambda run: make_env("jetbo"), NotFoundError, "did you mean jetbot?"),
     ],
 )
@@ -301,6 +302,35 @@ def test_a_mistake_raises_one_line(trained, tmp_path, monkeypatch, mistake, kind
     assert isinstance(caught.value, UserError)
     assert "--set" not in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+TAKE_PATHS = {
+    "run_dir": lambda bad: train("smoke", SMALL, run_dir=bad),
+    "output": lambda bad: tune("smoke", space="ppo", output=bad),
+    "storage": lambda bad: tune("smoke", space="ppo", storage=bad),
+    "run_or_checkpoint": load_policy,
+    "run resumed": lambda bad: train(resume=bad),
+    "run evaluated": evaluate,
+    "run compared": lambda bad: evaluate([bad]),
+    "run rendered": render,
+    "output of one": lambda bad: evaluate("pretrained:jetbot_egocentric", output=bad),
+    "output of two": lambda bad: evaluate(["pretrained:jetbot_egocentric"], output=bad),
+    "ranges": lambda bad: evaluate("pretrained:jetbot_egocentric", ranges=bad),
+}
+"""What takes a path, by the name that its message begins with."""
+
+
+@pytest.mark.parametrize("name", TAKE_PATHS)
+def test_what_is_no_path_is_refused_by_its_name(name, trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for bad in (trained, b"run", "", "a\0b", *([] if name == "run evaluated" else [3, ["run"]])):
+        with pytest.raises(InvalidError) as caught:
+            TAKE_PATHS[name](bad)
+        said = str(caught.value)
+        assert said.startswith(name.split()[0])
+        assert "is wrong: it should be a path or a name" in said
+        assert said.endswith(": give its run_dir") == (bad is trained)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -160,7 +160,7 @@ def test_what_is_for_the_list_is_refused_beside_a_run(runs, action, given, capsy
 
 def test_a_link_to_a_run_is_not_deleted(runs):
     Path("runs/link").symlink_to("older")
-    with pytest.raises(UserError, match="it is a link: name the folder, .*/runs/older$"):
+    with pytest.raises(UserError, match=r"it is a link: name the folder, .*/runs/older$"):
         list_runs.main(["--delete", "link", "--yes"])
     assert Path("runs/older").is_dir()
 

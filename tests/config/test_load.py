@@ -3,6 +3,8 @@
 import copy
 from pathlib import Path
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from jetbot_mjx.config import Config, ConfigError, load_config, parse_config
@@ -147,6 +149,33 @@ def test_overrides_may_be_a_mapping_and_the_configuration_an_object():
     assert load_config(base) is base
     assert values == kept
     assert base == load_config("smoke")
+
+
+SIZES = "ppo.network.policy_hidden_layer_sizes"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "plain"),
+    [
+        ("seed", np.int64(3), 3),
+        ("seed", np.int32(3), 3),
+        ("seed", np.array(3), 3),
+        ("seed", jnp.int32(3), 3),
+        ("tensorboard", np.bool_(False), False),
+        ("ppo.learning_rate", np.float32(0.5), 0.5),
+        ("ppo.learning_rate", jnp.float32(0.5), 0.5),
+        (SIZES, np.array([32, 16]), [32, 16]),
+        (SIZES, jnp.array([32, 16]), [32, 16]),
+        (SIZES, [np.int64(32), 16], [32, 16]),
+        (SIZES, (32, 16), [32, 16]),
+    ],
+)
+def test_numbers_and_arrays_of_numpy_and_jax_are_taken_as_python_s(key, value, plain):
+    found = load_config("smoke", {key: value})
+    assert found == load_config("smoke", {key: plain})
+    assert found.to_yaml() == load_config("smoke", {key: plain}).to_yaml()
+    with pytest.raises(ConfigError, match="seed = -3 is wrong"):
+        load_config("smoke", {"seed": np.int64(-3)})
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,8 @@ def test_a_word_that_names_no_checkpoint_is_refused_as_such(smoke_run):
 def test_a_single_checkpoint_folder_can_be_loaded(smoke_run):
     folder = find_checkpoint(smoke_run, 16_384)
     assert load_checkpoint(folder).env_steps == 16_384
+    for steps in (np.int64(16_384), jnp.int32(16_384)):
+        assert find_checkpoint(smoke_run, steps) == folder
 
 
 def refused(path, which="best"):

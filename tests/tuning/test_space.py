@@ -1,5 +1,6 @@
 """The file that describes a search space, and the errors for mistakes in it."""
 
+import numpy as np
 import pytest
 
 from jetbot_mjx.config import ConfigError, parse_config
@@ -103,6 +104,18 @@ def test_a_mistake_is_told_in_one_line(tmp_path, line, told):
         read_space(write(tmp_path, line), CONFIG)
     assert told in str(caught.value)
     assert str(tmp_path) in str(caught.value)
+
+
+def test_a_space_may_have_numbers_and_arrays_of_numpy():
+    sizes = "ppo.network.policy_hidden_layer_sizes"
+    space = {
+        "ppo.num_envs": {"low": np.int64(64), "high": np.int32(128), "log": np.bool_(True)},
+        sizes: {"choices": [np.array([16]), [32, 32]]},
+    }
+    assert read_space(space, CONFIG) == [
+        Parameter("ppo.num_envs", 64, 128, log=True),
+        Parameter(sizes, choices=((16,), (32, 32))),
+    ]
 
 
 def test_a_space_may_be_a_mapping_with_tuples():
