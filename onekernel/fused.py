@@ -269,7 +269,8 @@ class Fused:
             # Random keys are arguments as the words that they consist of.
             arguments, keywords = jax.tree.unflatten(structure, map(with_key, avals, words))
             # A result may be a number of Python, such as a reward that is always 1.
-            return jax.tree.map(_as_array, self._function(*arguments, **keywords))
+            results = self._function(*arguments, **keywords)
+            return jax.tree.map(lambda x: _as_array(x, "leave other results out"), results)
 
         def without_keys(*words: Array) -> PyTree:
             results = flat(*words)
@@ -442,8 +443,15 @@ class _Lowered:
         return dtypes_of(self.traced.jaxpr.outvars)
 
 
-def _as_array(x: PyTree) -> Array:
+_REST = "fix other arguments with functools.partial, and fuse the function of the rest"
+
+
+def _as_array(x: PyTree, remedy: str = _REST) -> Array:
     """Return an argument or a result as an array.
+
+    Args:
+      x: the argument or the result.
+      remedy: what to do with another one.
 
     Raises:
       TypeError: it is neither an array nor a number.
@@ -454,8 +462,7 @@ def _as_array(x: PyTree) -> Array:
         return jnp.asarray(x)
     except TypeError:
         raise TypeError(
-            f"a fused function takes and returns arrays and numbers, not {x!r}: fix other arguments"
-            " with functools.partial, and fuse the function of the rest"
+            f"a fused function takes and returns arrays and numbers, not {x!r}: {remedy}"
         ) from None
 
 

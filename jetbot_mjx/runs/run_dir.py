@@ -17,6 +17,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -380,7 +381,7 @@ def writing_to(path: Path) -> contextlib.AbstractContextManager[None]:
 def check_writable(path: Path) -> None:
     """Raise an error, before long work, if a folder for its results could not be created.
 
-    Nothing is created.
+    A folder is created for a moment, because only a try tells what a drive permits.
 
     Raises:
       UserError: the path or a part of it is not a folder, or may not be written.
@@ -389,8 +390,8 @@ def check_writable(path: Path) -> None:
         existing = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
         if not existing.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
-        if not os.access(existing, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        with tempfile.TemporaryDirectory(dir=existing, prefix="."):
+            pass
 
 
 @contextlib.contextmanager

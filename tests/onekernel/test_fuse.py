@@ -111,7 +111,7 @@ def test_it_is_a_decorator_of_functions_and_methods():
 def test_a_word_is_no_argument():
     with pytest.raises(TypeError, match="arrays and numbers, not 'up': fix other arguments with"):
         fuse(lambda x, way: x if way == "up" else -x)(1.0, "up")
-    with pytest.raises(TypeError, match="arrays and numbers, not 'up'"):
+    with pytest.raises(TypeError, match="arrays and numbers, not 'up': leave other results out"):
         fuse(lambda x: (x, "up"))(1.0)
 
 

@@ -19,6 +19,7 @@ from jetbot_mjx.runs.run_dir import (
     DamagedRunError,
     atomic_folder,
     changed_versions,
+    check_writable,
     claim_run_dir,
     is_occupied,
     make_folder,
@@ -130,6 +131,13 @@ def test_a_folder_below_a_file_cannot_be_written(tmp_path, use):
 def test_a_read_only_folder_cannot_be_written(tmp_path):
     tmp_path.chmod(0o500)
     assert "cannot be written: Permission denied" in refused(occupy, tmp_path)
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="only Linux has this drive")
+def test_a_drive_on_which_nothing_can_be_created_is_found_before_long_work(tmp_path):
+    assert "cannot be written" in refused(check_writable, Path("/proc/results"))
+    check_writable(tmp_path / "new" / "results")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_run_is_known_by_its_resolved_configuration(tmp_path):
