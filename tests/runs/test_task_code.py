@@ -334,7 +334,7 @@ def test_a_run_is_whole_without_the_module_and_resumes_with_its_own_task(
     capsys.readouterr()
     task_class, code = composition.find_code(config, [run_dir])
     assert (task_class.factor, code) == (3, None)
-    assert f"{NAME}.py on disk differs from the code this run was" in capsys.readouterr().err
+    assert "kicking_tools.py on disk differs from the code this run was" in capsys.readouterr().err
     # A new run has the new one, in the folders of all of its seeds.
     two = parse_config({**config.model_dump(), "seeds": 2})
     run_dirs = [tmp_path / "two" / f"seed-{n}" for n in (0, 1)]
