@@ -40,7 +40,7 @@ from onekernel.backends import Kernel, default_backend
 from onekernel.errors import UnsupportedError
 from onekernel.fused import derivatives_of
 from onekernel.kernel import is_debugging
-from onekernel.lower import LateProgram, scalarize
+from onekernel.lower import LateProgram, ScalarProgram, scalarize, word_shape
 
 # MJX prints two lines where its optional part Warp is not installed.
 with contextlib.redirect_stdout(io.StringIO()):
@@ -52,6 +52,9 @@ __all__ = ["FusedMjx", "MjxState", "fuse_mjx"]
 
 Fields = dict[str, Array]
 """Fields of `mjx.Data`, by name."""
+
+Shapes = dict[str, jax.ShapeDtypeStruct]
+"""Shapes and dtypes of fields, by name."""
 
 OnUnsupported = Literal["warn", "xla", "raise"]
 
@@ -67,8 +70,8 @@ _HELD = ("mocap_pos", "mocap_quat", "eq_active")
 class MjxState:
     """A `MjxState` holds what a step of one instance needs to know of the past, and no more.
 
-    The fields are those of `mjx.Data`, float32 but for `eq_active`. What a model does not have has
-    size 0.
+    The fields are those of `mjx.Data`: float32 but for `eq_active`, and float64 where the step was
+    made under `jax_enable_x64`. What a model does not have has size 0.
     """
 
     qpos: Float[Array, " nq"]
@@ -161,7 +164,7 @@ class FusedMjx:
         inputs = {"ctrl": ctrl, "qfrc_applied": qfrc_applied, "xfrc_applied": xfrc_applied}
         given = {name: x for name, x in inputs.items() if x is not None}
         fields = self._checked({**vars(state), **given})
-        # A kernel takes float32 only, and nothing of size 0.
+        # A kernel takes floats only, and nothing of size 0.
         words = {name: jnp.asarray(x, self._dtype) for name, x in fields.items() if x.size}
         carry = {name: x for name, x in words.items() if name in _CARRIED}
         held = {name: x for name, x in words.items() if name not in _CARRIED}
@@ -224,8 +227,12 @@ class FusedMjx:
         """Return fields as arrays of the dtypes that MJX's data has.
 
         Raises:
-          ValueError: a shape is wrong.
+          ValueError: a shape is wrong, or `jax_enable_x64` is not as it was for the model.
         """
+        if (now := jax.dtypes.canonicalize_dtype(np.float64)) != self._dtype:
+            raise ValueError(
+                f"the step was made for {self._dtype}, but jax_enable_x64 now asks for {now}"
+            )
         arrays = {}
         for name, x in fields.items():
             like = getattr(self._data, name)
@@ -254,6 +261,12 @@ class FusedMjx:
         with jax.default_matmul_precision("highest"):
             data = mjx.step(self.model, self._data.replace(**fields))
         return {name: getattr(data, name) for name in carry}
+
+    def _lowered(self, carry: Shapes, held: Shapes) -> ScalarProgram:
+        """Lower one physics step, in any thread, with the setting for 64 bits of its model."""
+        with jax.enable_x64(self._dtype == np.float64):
+            skips = jax.default_backend() == "gpu"
+            return scalarize(self._substep, carry, held, words=True, skips=skips)
 
     def _xla_step(self, carry: Fields, held: Fields) -> Fields:
         """Make all physics steps with a loop that XLA compiles."""
@@ -299,7 +312,7 @@ class FusedMjx:
     def _make_kernel(self, held: tuple[str, ...]) -> Kernel:
         """Return a kernel that repeats a physics step `n_substeps` times; it is lowered later."""
 
-        def shapes(names: tuple[str, ...]) -> dict[str, jax.ShapeDtypeStruct]:
+        def shapes(names: tuple[str, ...]) -> Shapes:
             arrays = {name: getattr(self._data, name) for name in names}
             return {
                 name: jax.ShapeDtypeStruct(x.shape, self._dtype)
@@ -311,17 +324,19 @@ class FusedMjx:
         leaves, structure = jax.tree.flatten(arguments)
         content = np.zeros(mujoco.mj_sizeModel(self.mj_model), np.uint8)
         mujoco.mj_saveModel(self.mj_model, None, content)
+        shapes_of_words = [word_shape(x.shape, self._dtype) for x in leaves]
         program = LateProgram(
-            lambda: scalarize(self._substep, *arguments, skips=jax.default_backend() == "gpu"),
-            [x.shape for x in leaves],
-            [x.shape for x in jax.tree.leaves(arguments[0])],
+            lambda: self._lowered(*arguments),
+            shapes_of_words,
+            shapes_of_words[: len(arguments[0])],
         )
 
         def inline(*leaves: Array) -> list[Array]:
             carry, held = jax.tree.unflatten(structure, leaves)
             return jax.tree.leaves(self._differentiable_step(carry, held))
 
-        identity = f"mjx.step {hashlib.sha256(content.tobytes()).hexdigest()} {held}"
+        digest = hashlib.sha256(content.tobytes()).hexdigest()
+        identity = f"mjx.step {digest} {self._dtype} {held}"
         kernel = Kernel(
             program,
             carried=len(arguments[0]),
@@ -331,6 +346,8 @@ class FusedMjx:
             ),
             on_fallback=self._warn_once,
             inline=inline,
+            argument_dtypes=[self._dtype] * len(leaves),
+            result_dtypes=[self._dtype] * len(arguments[0]),
             identity=identity,
         )
         avals = [ShapedArray(x.shape, x.dtype) for x in leaves]

@@ -269,8 +269,9 @@ def _sums_of_terms(
             products = [graph.apply("mul", x, y) for x, y in itertools.product(*terms[i])]
             added = [graph.apply("add", *pair) for pair in zip(added, products, strict=True)]
             count += math.prod(sum(not equals(x, 0) for x in side) for side in terms[i])
-        is_worth_it = condition is not None and count >= MIN_BRANCH_PRODUCTS
-        totals = graph.branch(condition, totals, added) if is_worth_it else added
+        if condition is not None and count >= MIN_BRANCH_PRODUCTS:
+            added = graph.branch(condition, totals, added)
+        totals = added
     return totals
 
 

@@ -172,6 +172,7 @@ class LateProgram(ScalarProgram):
 def scalarize(
     function: Callable[..., PyTree],
     *arguments: PyTree,
+    words: bool = False,
     finite: bool = True,
     approximate: bool = False,
     skips: bool = False,
@@ -181,6 +182,7 @@ def scalarize(
     Args:
       function: a jittable function of one instance.
       *arguments: pytrees of arrays, or of objects with a shape and a dtype.
+      words: as for `scalarize_part`.
       finite: whether all numbers are finite, as for `ExprGraph`.
       approximate: whether exp, log and 1/x are operations, which only GPUs have instructions for:
         approximate ones. Otherwise exp and log become polynomials.
@@ -197,7 +199,7 @@ def scalarize(
     closed = jax.make_jaxpr(function)(*arguments)
     variables = closed.jaxpr.invars, closed.jaxpr.outvars
     options = {"finite": finite, "approximate": approximate, "skips": skips}
-    return scalarize_part(closed, *variables, **options)
+    return scalarize_part(closed, *variables, words=words, **options)
 
 
 def scalarize_part(

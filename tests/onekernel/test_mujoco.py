@@ -27,7 +27,7 @@ from helpers.small_models import (
     difference,
     model_of,
 )
-from onekernel import KernelError, UnsupportedError, fuse
+from onekernel import UnsupportedError, fuse
 from onekernel.lower import jaxpr
 from onekernel.mujoco import MjxState, fuse_mjx
 
@@ -242,13 +242,15 @@ def test_debug_nans_finds_a_state_that_is_not_finite(falls):
         falls(state, [])
 
 
-def test_a_step_in_float64_is_refused(falls):
+def test_a_step_in_float64_is_that_of_c(falls):
     with jax.enable_x64(True):
+        assert compared(model_of(HOPPER), n_substeps=3)[0] < 1e-12
         step = fuse_mjx(falls.mj_model)
-        with pytest.raises(KernelError, match="takes float32 only, not float64"):
-            step(step.init(), jnp.zeros(falls.mj_model.nu))
-        # What was made before stays of float32.
-        assert falls(falls.init(), jnp.zeros(falls.mj_model.nu)).qpos.dtype == np.float32
+        state = step.init()
+        with pytest.raises(ValueError, match="made for float32, but"):
+            falls.init()
+    with pytest.raises(ValueError, match="made for float64, but jax_enable_x64 now asks for f"):
+        step(state, jnp.zeros(0))
 
 
 def test_wrong_arguments_are_named():
