@@ -50,7 +50,7 @@ MOVES = {
     "root": lambda x, y: jnp.sqrt(1 + x * x) * y,
     "quotient": lambda x, y: x / (1 + y * y),
     "power": lambda x, y: (1 + x * x) ** y,
-    "cube": lambda x, y: x**3 - y**-2 / (1 + y**-2),
+    "cube": lambda x, y: x**3 - (5 + y) ** -2,
     "angle": lambda x, y: jnp.arctan2(x, 2 + y * y),
     "erf": lambda x, y: erf(x) + y,
     "logaddexp": jnp.logaddexp,

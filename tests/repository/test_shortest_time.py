@@ -39,6 +39,24 @@ def test_a_start_turns_and_then_goes_straight_ahead(example):
     assert (starts[:, -1, 0] == 1.0).all()
 
 
+def test_a_round_starts_with_the_best_of_each_goal_and_around_them(example):
+    found = jnp.arange(40.0).reshape(20, 1, 2) / 100
+    steps = jnp.array([9.0, 3, 8, 7, 2, 6, 5, jnp.inf, 1, 4] + 10 * [5.0])
+    starts = example.around_the_best(jax.random.key(0), found, steps, goals=2)
+    # The eight best of ten, whose order is that of their numbers of steps.
+    order = [8, 4, 1, 9, 6, 5, 3, 2]
+    np.testing.assert_array_equal(starts[:8], found[jnp.array(order)])
+    np.testing.assert_array_equal(starts[10:18], found[10:18])
+    assert (starts[8:10] != found[jnp.array(order[:2])]).all()
+    assert (starts[18:] != found[10:12]).all()
+    np.testing.assert_allclose(starts[8:10], found[jnp.array(order[:2])], atol=1.0)
+    # Where there are fewer sequences than parents, each is one.
+    np.testing.assert_array_equal(
+        example.around_the_best(jax.random.key(0), found[:4], steps[:4], 2),
+        found[jnp.array([1, 0, 3, 2])],
+    )
+
+
 def test_a_duration_without_steps_is_refused(example):
     with pytest.raises(UserError, match=r"^--seconds 0: name a duration from 0\.03 to 60$"):
         example.main(["--seconds", "0"])
