@@ -116,7 +116,7 @@ def improve(
       robot is farther inside the goal.
     """
     physics, radius = env.config.physics, env.config.task.success_radius
-    sharp = jnp.float32(_EDGES[-1][-1])
+    sharp = jnp.asarray(_EDGES[-1][-1])
     step = fuse_mjx(env.mj_model, physics.n_substeps)
     adam = optax.adam(optax.cosine_decay_schedule(_RATE, len(edges)))
 
