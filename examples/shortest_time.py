@@ -124,9 +124,7 @@ def improve(
         away = distances(env, step, actions, goal)
         there = away < radius
         count = jnp.where(there.any(), jnp.argmax(there) + 1.0, jnp.inf)
-        return steps_outside(away, radius, edge), count + 0.01 * steps_outside(
-            away, radius, _EDGES[-1][-1]
-        )
+        return steps_outside(away, radius, edge), count + 0.01 * steps_outside(away, radius, sharp)
 
     gradient = jax.vmap(jax.grad(loss, has_aux=True), (0, 0, None))
 

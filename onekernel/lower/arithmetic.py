@@ -235,7 +235,7 @@ def _dot_general(
             [[graph.convert(x, dtype) for x in vector] for vector in group]
             for group in (row_group, column_group)
         )
-        multiply = _sums_of_terms if graph.skips and graph.finite else _sums
+        multiply = _sums_by_truth if graph.skips and graph.finite else _sums
         sums += multiply(graph, left, right, dtype.type(0))
     return scalar_array(sums, shape_of(equation.outvars[0]))
 
@@ -254,15 +254,29 @@ def _sums(graph: ExprGraph, rows: _Vectors, columns: _Vectors, zero: Scalar) -> 
     return sums
 
 
+def _sums_by_truth(
+    graph: ExprGraph, rows: _Vectors, columns: _Vectors, zero: Scalar
+) -> list[Scalar]:
+    """Return the same sums; branches skip what is 0 because a truth value in it is false."""
+    # Rows with the same truth value are summed together, such as those of a contact.
+    groups: dict[Expr | None, list[int]] = {}
+    for i, row in enumerate(rows):
+        groups.setdefault(_condition_of(row), []).append(i)
+    sums = {}
+    for places in groups.values():
+        found = iter(_sums_of_terms(graph, [rows[i] for i in places], columns, zero))
+        sums |= {i: [next(found) for _ in columns] for i in places}
+    return [total for i in range(len(rows)) for total in sums[i]]
+
+
 def _sums_of_terms(
     graph: ExprGraph, rows: _Vectors, columns: _Vectors, zero: Scalar
 ) -> list[Scalar]:
-    """Return the same sums; branches skip the terms where a truth value in them is false."""
     totals = [zero] * (len(rows) * len(columns))
-    # The i-th numbers of all rows, and of all columns; there may be no rows or columns.
+    # The i-th numbers of all rows, and of all columns; there may be no columns.
     terms = list(zip(zip(*rows, strict=True), zip(*columns, strict=True), strict=False))
     conditions = [_condition_of(left) or _condition_of(right) for left, right in terms]
-    # One branch is around successive terms with the same truth value, such as those of a contact.
+    # One branch is around successive terms with the same truth value.
     for condition, places in itertools.groupby(range(len(terms)), conditions.__getitem__):
         added, count = totals, 0
         for i in places:

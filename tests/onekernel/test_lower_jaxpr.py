@@ -754,16 +754,24 @@ def test_what_is_multiplied_by_false_is_skipped(function):
     assert len(placed(skipping, PlacedBranch)) >= 6
 
 
-def test_successive_rows_with_one_truth_value_share_a_branch():
-    def forces(rows, x):
-        active = jnp.repeat(rows[::3] @ x < 0, 3)
-        return (rows.T * active) @ jnp.ones(len(rows))
+def forces(rows, x):
+    active = jnp.repeat(rows[::3] @ x < 0, 3)
+    return (rows.T * active) @ jnp.ones(len(rows))
 
-    program = jaxpr.scalarize(forces, *ROWS, skips=True)
+
+def velocities(rows, x):
+    # The rows of a truth value do not follow each other.
+    active = jnp.tile(rows[:2] @ x < 0, 3)
+    return (rows * active[:, None]) @ x
+
+
+@pytest.mark.parametrize("function", [forces, velocities])
+def test_rows_with_one_truth_value_share_a_branch(function):
+    program = jaxpr.scalarize(function, *ROWS, skips=True)
     assert len(placed(program, PlacedBranch)) == 2
     rows = np.float32(np.random.default_rng(0).normal(size=(20, 6, 4)))
     points = np.ones((20, 4), np.float32)
-    plain = evaluate(jaxpr.scalarize(forces, *ROWS), [rows, points])[0]
+    plain = evaluate(jaxpr.scalarize(function, *ROWS), [rows, points])[0]
     np.testing.assert_array_equal(evaluate(program, [rows, points])[0], plain)
 
 
