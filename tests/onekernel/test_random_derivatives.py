@@ -87,7 +87,9 @@ def compare(function, has_reverse_mode, seed, dtype):
         ours = np.asarray(run(dtype(points)))
     assert ours.dtype == dtype
     # A function may enlarge round-off: by how much, the error of float32 tells.
-    allowed = CLOSE[dtype] * np.abs(precise).max() + 4 * np.abs(theirs - precise).max()
+    rough = theirs if dtype == np.float32 else one_by_one(along, points, np.float32)
+    enlarged = np.abs(rough - precise).max() * np.finfo(dtype).eps / np.finfo(np.float32).eps
+    allowed = CLOSE[dtype] * np.abs(precise).max() + 4 * enlarged
     assert np.abs(ours - theirs).max() <= allowed, f"{ours}, not {theirs}, precisely {precise}"
     found = differences(function, points[0], direction)
     if found is not None:
