@@ -27,10 +27,6 @@ STEADY = 1e-7
 PRECISE = 1e-6
 """What derivatives in float64 may differ by from differences, as a part of them."""
 
-JUMP = 1e-3
-"""By how much the results of a function differ in float32 where a computed index changes. There
-they have no common derivative."""
-
 CLOSE = {np.float32: 1e-4, np.float64: 1e-10}
 """What those of kernels may differ by from JAX's."""
 
@@ -84,9 +80,6 @@ def compare(function, has_reverse_mode, seed, dtype):
     direction = np.random.default_rng(seed).normal(size=points.shape[1])
     along = derivative(function, direction, has_reverse_mode)
     precise = one_by_one(along, points, np.float64)
-    values = [one_by_one(function, points, kind) for kind in (np.float64, dtype)]
-    if np.abs(values[1] - values[0]).max() > JUMP:
-        return False
     theirs = one_by_one(along, points, dtype)
     one = fuse(function, on_unsupported="raise")
     run = jax.jit(jax.vmap(derivative(one, direction, has_reverse_mode)))
