@@ -628,7 +628,7 @@ def test_a_dump_with_pickles_is_refused(run, canary):
 
 
 EXECUTES = re.compile(
-    r"\bpickle\.loads?\(|\bexec\(compile|[^_.\w]eval\(|allow_pickle=True|yaml\.load\("
+    r"\bpickle\.(loads?\(|Unpickler\b)|\bexec\(compile|[^_.\w]eval\(|allow_pickle=True|yaml\.load\("
 )
 
 MAY_EXECUTE = {
