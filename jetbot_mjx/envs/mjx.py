@@ -17,7 +17,9 @@ from jetbot_mjx.devices import default_device_cpu
 from mujoco import mjx
 from mujoco.mjx import ConeType as ConeType
 from mujoco.mjx import Data, Model
+from mujoco.mjx import GeomType as GeomType
 from mujoco.mjx import step as step
+from mujoco.mjx._src import collision_driver as collision_driver
 from mujoco.mjx._src import solver as solver
 
 _Tree = TypeVar("_Tree", Model, Data)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.devices import require_float32
-from jetbot_mjx.envs import line_search, mjx
+from jetbot_mjx.envs import box_contacts, line_search, mjx
 from jetbot_mjx.envs.kernel_impl import KernelImpl
 from jetbot_mjx.envs.robot_model import mocap_ids
 from jetbot_mjx.envs.state import PhysicsState
@@ -146,7 +146,11 @@ class Physics:
             data = data.replace(mocap_pos=mocap_pos[0])
         # By default GPUs multiply float32 matrices in TF32, with which the contact solver diverges.
         # Only physics requires full precision; networks choose their own.
-        with jax.default_matmul_precision("highest"), line_search.relative_costs():
+        with (
+            jax.default_matmul_precision("highest"),
+            line_search.relative_costs(),
+            box_contacts.every_corner(),
+        ):
             data = mjx.step(jax.tree.unflatten(treedef, leaves), data)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
 

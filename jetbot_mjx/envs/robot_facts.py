@@ -34,6 +34,9 @@ _TRIES = 6
 _DAMPED = 0.6
 """Power of the turn by which the next one differs: turns grow by up to its square."""
 
+_OVERSHOOTS = 2.0
+"""Time steps per time constant of a motor from which Euler's method is unstable."""
+
 _BADLY = 0.3
 """Share from which a training is told so."""
 
@@ -71,7 +74,7 @@ def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
     if (reach := reach_on_floor(env.task, height)) is not None:
         yield "goals", f"reached within {1e3 * reach:.3g} mm on the floor"
     follows = [*_speed_hint(env, trial, _WELL)] or _turn_hint(env, trial, _WELL)
-    for hint in (*follows, *_goal_hints(env, trial), *_contact_hint(model)):
+    for hint in (*follows, *_goal_hints(env, trial), *_simulation_hints(env)):
         yield "hint", hint
 
 
@@ -89,9 +92,8 @@ def training_hints(env: JetBotEnv) -> list[str]:
         trial = drive_trial(env.config, env.physics.mj_model, env.drive)
     if trial is None:
         return []
-    contacts = _contact_hint(env.physics.mj_model)
     follows = [*_speed_hint(env, trial, _BADLY)] or _turn_hint(env, trial, _BADLY)
-    return [*follows, *_goal_hints(env, trial), *contacts]
+    return [*follows, *_goal_hints(env, trial), *_simulation_hints(env)]
 
 
 def _speed_hint(env: JetBotEnv, trial: Trial, least: float) -> Iterator[str]:
@@ -175,6 +177,67 @@ def _goal_hints(env: JetBotEnv, trial: Trial) -> Iterator[str]:
             f"half a turn takes {half:.2g} s, beyond the horizon of ppo.discounting ="
             f" {env.config.ppo.discounting:g}: {1.0 - proposed * env.dt / half:.3g} would reach"
             " further"
+        )
+
+
+def _simulation_hints(env: JetBotEnv) -> Iterator[str]:
+    """Yield what makes the simulation of a robot inexact or slow.
+
+    Args:
+      env: one environment, unwrapped.
+    """
+    model, drive = env.physics.mj_model, env.drive
+    if isinstance(drive, DifferentialDrive | AckermannDrive):
+        yield from _motor_hint(model, drive)
+    yield from _mesh_hint(model)
+    yield from _contact_hint(model)
+
+
+def _motor_hint(model: mujoco.MjModel, drive: DifferentialDrive | AckermannDrive) -> Iterator[str]:
+    """Yield which motors overshoot, in a step of Euler's method, where a wheel has no grip.
+
+    Args:
+      model: the compiled scene, with the robot.
+      drive: the robot's drive.
+    """
+    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
+        return
+    step = model.opt.timestep
+    found = []
+    for wheel in drive.driven if isinstance(drive, AckermannDrive) else drive.wheels:
+        index = wheel.actuator
+        dof = model.jnt_dofadr[model.actuator_trnid[index, 0]]
+        gain = -model.actuator_biasprm[index, 2] * model.actuator_gear[index, 0] ** 2  # [N m s]
+        # Euler's method damps joints with the speed after the step, motors with that before it.
+        inertia = model.dof_M0[dof] + step * model.dof_damping[dof]
+        if step * (gain + model.dof_damping[dof]) > _OVERSHOOTS * inertia:
+            name = model.actuator(index).name.removeprefix(PREFIX)
+            found.append((inertia / gain, name, step * gain - inertia))
+    if found:
+        constant, name, missing = min(found)
+        yield (
+            f"the motor of {name}{' and others' * (len(found) > 1)} chatters where the wheel slips"
+            f" or leaves the floor: it changes the wheel's speed within {1e3 * constant:.2g} ms,"
+            f" and physics.sim_dt is {1e3 * step:.2g} ms. An armature of {missing:.1e} kg m² more,"
+            " a smaller kv or a shorter physics.sim_dt corrects it"
+        )
+
+
+def _mesh_hint(model: mujoco.MjModel) -> Iterator[str]:
+    """Yield which meshes may touch the floor otherwise than in C MuJoCo.
+
+    Args:
+      model: the compiled scene, with the robot.
+    """
+    floor = model.geom("floor").id
+    meshes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).tolist()
+    names = [model.geom(x).name.removeprefix(PREFIX) for x in meshes if _may_touch(model, floor, x)]
+    if names:
+        named = ", ".join(name or "a mesh" for name in names[:3])
+        yield (
+            f"where {named}{' and others' * (len(names) > 3)} touches the floor, MJX has other"
+            " points of contact than C MuJoCo: a box, spheres, capsules or a cylinder in its place"
+            " have the same"
         )
 
 

@@ -160,3 +160,32 @@ def test_what_is_wrong_is_told(checked, tmp_path):
     (tmp_path / "ball.xml").write_text("<mujoco><worldbody/></mujoco>")
     with pytest.raises(UserError, match="no actuators turn wheels on both sides"):
         checked(tmp_path / "ball.xml")
+
+
+def test_a_motor_faster_than_a_time_step_is_told_with_the_armature_that_it_needs(checked, tmp_path):
+    def told(armature):
+        change = [('armature="6e-4"', f'armature="{armature}"')]
+        return checked(copy_robot(tmp_path, "turtlebot", change))
+
+    printed = told(0)
+    assert "the motor of left and others chatters where the wheel slips" in printed
+    constant, step, missing = re.search(
+        r"speed within (\S+) ms, and physics.sim_dt is (\S+) ms. An armature of (\S+) kg", printed
+    ).groups()
+    assert 2 * float(constant) < float(step)
+    assert "chatters" not in told(missing)
+    # Twice the time constant is the limit: there, each step reverses the error.
+    assert "chatters" in told(float(missing) / 2 - 0.06 * float(missing))
+    assert "chatters" not in told(float(missing) / 2)
+
+
+def test_a_mesh_that_may_touch_the_floor_is_told(checked, tmp_path):
+    corners = "0 0 0 0.1 0 0 0 0.1 0 0 0 0.1"
+    asset = ("<worldbody>", f'<asset><mesh name="m" vertex="{corners}"/></asset><worldbody>')
+    head = '<geom name="nose" type="mesh" mesh="m" mass="0.01"{}/><geom name="head"'
+    for extra, expected in ((' contype="1"', True), (' contype="0"', False)):
+        folder = tmp_path / str(expected)
+        folder.mkdir()
+        changes = [asset, ('<geom name="head"', head.format(extra))]
+        printed = checked(copy_robot(folder, "rover", changes))
+        assert ("where nose touches the floor, MJX has other points" in printed) == expected
