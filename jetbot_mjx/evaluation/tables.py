@@ -24,7 +24,7 @@ def summarize_report(report: Report | ReturnReport) -> str:
     text = (
         f"{_count(report.policy.episodes, 'fixed goal')} (set {GOAL_SET_VERSION}), policy after"
         f" {report.env_steps:,} steps\n{policies_table({'policy': report})}\n"
-        f"{_step_cost_line(report)}"
+        f"{_step_cost_line(report)}{_simulators_line(report)}"
         f"{best_known_lines(report)}{lower_bound_line(report)}{robustness_table(report)}"
         f"report: {report.folder / 'report.html'}"
     )
@@ -38,6 +38,20 @@ def summarize_report(report: Report | ReturnReport) -> str:
 def _step_cost_line(report: Report) -> str:
     cost = report.config.task.step_cost
     return f"each step costs {cost:g} m of the return\n" if cost else ""
+
+
+def _simulators_line(report: Report) -> str:
+    """Return why a policy's success in C MuJoCo differs, if the intervals do not overlap."""
+    if report.mujoco is None:
+        return ""
+    here, there = report.policy, report.mujoco.policy
+    if here.success_low <= there.success_high and there.success_low <= here.success_high:
+        return ""
+    return (
+        "the success depends on the simulator's numerics: C MuJoCo computes with another"
+        " integrator, friction cone,\n  softness of contacts and time step than the training"
+        " (docs/robustness.md)\n"
+    )
 
 
 def summarize_comparison(comparison: Comparison | ReturnComparison) -> str:

@@ -217,6 +217,16 @@ def test_a_cost_of_steps_is_told_beside_the_return(tmp_path):
     assert "Each step costs 0.02 m of the return." in page.with_suffix(".md").read_text("utf-8")
 
 
+def test_that_success_depends_on_the_simulator_is_told_where_intervals_do_not_overlap(tmp_path):
+    report = report_of(tmp_path, np.ones(6))
+    for low, high, told in ((0.2, 0.4, True), (0.2, report.policy.success_low, False)):
+        there = report.policy._replace(success_low=low, success_high=high)
+        both = report._replace(mujoco=MujocoResult(OTHER_NUMERICS, there, None))
+        said = "success depends on the simulator's numerics"
+        assert (said in summarize_report(both)) is told
+    assert said not in summarize_report(report)
+
+
 def costing(report, cost):
     """A report whose task costs so much in each step [m]."""
     task = report.config.task.model_copy(update={"step_cost": cost})
