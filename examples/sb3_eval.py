@@ -11,13 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from stable_baselines3 import PPO
-from stable_baselines3.common.preprocessing import is_image_space
 
 from jetbot_mjx import cli
-from jetbot_mjx.adapters import JetBotGymEnv
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, requires_extra
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,13 +26,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
       The exit code.
 
     Raises:
-      UserError: There is no policy, or no display.
+      UserError: There is no policy, no display or no Stable-Baselines3.
     """
     parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policy", type=Path, default=Path("sb3_policy/jetbot.zip"))
     parser.add_argument("--episodes", type=cli.positive_int, default=20, help="default: 20")
     parser.add_argument("--headless", action="store_true", help="do not open a window")
     options = parser.parse_args(arguments)
+    with requires_extra("sb3", parser.prog):
+        import torch
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.preprocessing import is_image_space
+
+    from jetbot_mjx.adapters import JetBotGymEnv
+
     if not options.policy.is_file():
         raise UserError(
             f"--policy {options.policy} does not exist: examples/sb3_train.py saves one"

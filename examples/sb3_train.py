@@ -10,19 +10,21 @@ To run a script that follows the tutorial, change its import of the environment:
     from jetbot_mjx.adapters import JetBotGymEnv as JetBotEnv
 """
 
+from __future__ import annotations
+
 import argparse
 import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
-
-import torch
-from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import CheckpointCallback
-from stable_baselines3.common.vec_env import VecMonitor
+from typing import TYPE_CHECKING
 
 from jetbot_mjx import cli
-from jetbot_mjx.adapters import JetBotGymEnv
-from jetbot_mjx.adapters.stable_baselines3 import JetBotVecEnv
+from jetbot_mjx.errors import requires_extra
+
+if TYPE_CHECKING:
+    from gymnasium import Env
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecEnv
 
 _STEPS = 2560
 """Environment steps between two updates, over all robots."""
@@ -38,6 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
       The exit code.
+
+    Raises:
+      MissingPackageError: Stable-Baselines3 is not installed.
     """
     parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=cli.positive_int, default=500_000, help="default: 500000")
@@ -49,6 +54,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--folder", type=Path, default=Path("sb3_policy"))
     options = parser.parse_args(arguments)
+    with requires_extra("sb3", parser.prog):
+        from stable_baselines3.common.callbacks import CheckpointCallback
+        from stable_baselines3.common.vec_env import VecMonitor
+
+    from jetbot_mjx.adapters import JetBotGymEnv
+    from jetbot_mjx.adapters.stable_baselines3 import JetBotVecEnv
 
     config = _CAMERA if options.camera else None
     if options.num_envs == 1:
@@ -56,10 +67,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         robots = JetBotVecEnv(options.num_envs, config=config)
         env = VecMonitor(robots, info_keywords=("is_success",))
+    ppo = _ppo(env, options)
+    # `CheckpointCallback` counts calls of `step`, each of which steps all robots.
+    every = CheckpointCallback(max(1, 10_000 // options.num_envs), str(options.folder), "jetbot")
+    ppo.learn(options.steps, callback=every)
+    ppo.save(options.folder / "jetbot")
+    env.close()
+    return 0
+
+
+def _ppo(env: Env | VecEnv, options: argparse.Namespace) -> PPO:
+    """Return PPO before its first step, with the tutorial's hyperparameters."""
+    import torch
+    from stable_baselines3 import PPO
+
     # More threads do not speed up networks of this size, and slow down on a busy machine.
     torch.set_num_threads(1)
     layers = {"pi": [16, 128, 128, 128], "vf": [16, 128, 128, 128]}
-    ppo = PPO(
+    return PPO(
         "CnnPolicy" if options.camera else "MlpPolicy",
         env,
         n_steps=_STEPS // options.num_envs,
@@ -80,12 +105,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         seed=0,
         verbose=1,
     )
-    # `CheckpointCallback` counts calls of `step`, each of which steps all robots.
-    every = CheckpointCallback(max(1, 10_000 // options.num_envs), str(options.folder), "jetbot")
-    ppo.learn(options.steps, callback=every)
-    ppo.save(options.folder / "jetbot")
-    env.close()
-    return 0
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ import dataclasses
 import functools
 import hashlib
 import io
+import numbers
 import threading
 import warnings
 from collections.abc import Mapping
@@ -407,11 +408,12 @@ def fuse_mjx(
     """
     if not isinstance(mj_model, mujoco.MjModel):
         raise TypeError(f"mj_model is a {type(mj_model).__name__}, not a mujoco.MjModel")
-    if n_substeps < 1:
-        raise ValueError(f"n_substeps is {n_substeps}, not at least 1")
+    whole = isinstance(n_substeps, numbers.Integral) and not isinstance(n_substeps, bool)
+    if not whole or n_substeps < 1:
+        raise ValueError(f"n_substeps is {n_substeps!r}, not a whole number of at least 1")
     if on_unsupported not in get_args(OnUnsupported):
         raise ValueError(f"on_unsupported is {on_unsupported!r}, not warn, xla or raise")
-    return FusedMjx(mj_model, n_substeps, on_unsupported)
+    return FusedMjx(mj_model, int(n_substeps), on_unsupported)
 
 
 def _uncommitted(tree: Any) -> Any:

@@ -49,12 +49,25 @@ def default_output(prefix: str = "") -> Path:
     return RESULTS / (prefix + (f"{name}-x{count}.json" if count > 1 else f"{name}.json"))
 
 
-def check_output(path: Path) -> None:
-    """Check before minutes of measuring that the file can be written.
+def output_for(given: Path | None, stored: Path, *, is_own: bool) -> Path | None:
+    """Return the file of the results; None: there is none.
+
+    Args:
+      given: what `--output` says.
+      stored: the repository's own file.
+      is_own: whether something else is measured than what that file is of, so that it must stay.
+    """
+    return given or (None if is_own else stored)
+
+
+def check_output(path: Path | None) -> None:
+    """Check before minutes of measuring that the file, if there is one, can be written.
 
     Raises:
       UserError: It cannot be written.
     """
+    if path is None:
+        return
     if path.is_dir():
         raise UserError(f"--output {path} is a folder: name a file in it")
     try:
@@ -63,12 +76,14 @@ def check_output(path: Path) -> None:
         raise UserError(f"--output {path} cannot be written: {error.strerror}") from None
 
 
-def write(path: Path, values: dict[str, Any]) -> None:
-    """Write a file of results.
+def write(path: Path | None, values: dict[str, Any]) -> None:
+    """Write a file of results, if there is one.
 
     Raises:
       UserError: The file cannot be written.
     """
+    if path is None:
+        return
     try:
         write_json(path, values)
     except OSError as error:

@@ -54,7 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ("headings", Grid().headings, "headings on the circle"),
     ):
         parser.add_argument(f"--{name}", type=cli.positive_int, default=value, help=what)
-    parser.add_argument("--output", type=Path, default=BOUND_FILE)
+    what = "default: the package's own, where reports find it"
+    parser.add_argument("--output", type=Path, default=BOUND_FILE, help=what)
     options = parser.parse_args(arguments)
     require_device()
     use_compilation_cache()

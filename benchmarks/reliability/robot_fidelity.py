@@ -26,7 +26,7 @@ from jaxtyping import Float
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks import RESULTS
-from benchmarks.harness.results import check_output, write
+from benchmarks.harness.results import check_output, output_for, write
 from benchmarks.harness.timing import env_keys
 from jetbot_mjx import cli
 from jetbot_mjx.config import load_config
@@ -206,13 +206,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--friction", type=cli.number(float, 0.0), default=0.2, help="of the slippery floor"
     )
     parser.add_argument("--seed", type=cli.whole_number(0), default=0, help="of the commands")
-    parser.add_argument("--output", type=Path, default=RESULTS / "robot-fidelity-cpu.json")
+    stored = RESULTS / "robot-fidelity-cpu.json"
+    parser.add_argument(
+        "--output",
+        type=Path,
+        help=f"JSON file (default: results/{stored.name} of those five, none of others)",
+    )
     options = parser.parse_args(arguments)
-    check_output(options.output)
+    names = options.names or [*ROBOTS]
+    output = output_for(options.output, stored, is_own={*names} != {*ROBOTS})
+    check_output(output)
     print("| robot | friction | median, mm | 99 % | worst | beyond 2 mm | explained | driven, m |")
     print("|---|--:|--:|--:|--:|--:|--:|--:|")
     rows = []
-    for name in options.names or ROBOTS:
+    for name in names:
         source, settings = ROBOTS.get(name, (name, ()))
         env = make_jetbot_env(load_config(source, settings)).blind()
         for friction in (None, options.friction):
@@ -220,7 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(_line(rows[-1]), flush=True)
     measured = {key: getattr(options, key) for key in ("robots", "seconds", "seed")}
     table = [{**row._asdict(), "explained": row.explained} for row in rows]
-    write(options.output, {"versions": versions(), **measured, "fidelity": table})
+    write(output, {"versions": versions(), **measured, "fidelity": table})
     return 0 if all(row.is_right for row in rows) else 1
 
 

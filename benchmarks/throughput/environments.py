@@ -21,7 +21,14 @@ import jax
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.harness.measurements import Sizes
-from benchmarks.harness.results import check_output, conditions, counts, default_output, write
+from benchmarks.harness.results import (
+    check_output,
+    conditions,
+    counts,
+    default_output,
+    output_for,
+    write,
+)
 from benchmarks.harness.timing import (
     Carry,
     Tally,
@@ -137,7 +144,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("configs", nargs="*", metavar="CONFIG", help="other configurations")
     parser.add_argument("--num-envs", type=counts, metavar="N,N,...")
     parser.add_argument("--repeats", type=cli.positive_int, default=5, help="rounds (default: 5)")
-    parser.add_argument("--output", type=Path, help="default: results/environments-<device>.json")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        help="default: results/environments-<device>.json, none of other configurations",
+    )
     return parser
 
 
@@ -154,7 +165,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
       UserError: A configuration is wrong, or the file cannot be written.
     """
     options = _parser().parse_args(arguments)
-    output = options.output or default_output("environments-")
+    stored = default_output("environments-")
+    output = output_for(options.output, stored, is_own=bool(options.configs))
     check_output(output)
     sizes = Sizes(repeats=options.repeats)
     configs = _configs(options.configs)

@@ -134,7 +134,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--most", type=cli.fraction, default=0.15, help="exit code 1 above (default: 0.15)"
     )
-    parser.add_argument("--output", type=Path, help="JSON file")
+    parser.add_argument(
+        "--output", type=Path, help="default: results/randomization-cost-<device>.json"
+    )
     return parser
 
 

@@ -230,10 +230,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", nargs="?", help="a run folder; default: a new training")
     parser.add_argument("--seeds", type=cli.positive_int, default=5, help="default: 5")
-    parser.add_argument("--output", type=Path, default=results.default_output("web-page-"))
+    parser.add_argument(
+        "--output", type=Path, help="default: results/web-page-<device>.json, none of a run folder"
+    )
     options = parser.parse_args(arguments)
     try:
-        results.check_output(options.output)
+        stored = results.default_output("web-page-")
+        output = results.output_for(options.output, stored, is_own=options.run is not None)
+        results.check_output(output)
         with tempfile.TemporaryDirectory() as folder, open_tab() as tab:
             run = options.run or train_run(Path(folder, "jetbot_egocentric"))
             n_substeps = load_checkpoint(run).config.physics.n_substeps
@@ -253,7 +257,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 **measured,
             }
         print(summarize(values))
-        results.write(options.output, values)
+        results.write(output, values)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

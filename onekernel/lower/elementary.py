@@ -97,7 +97,8 @@ _COSINE = Polynomial(lambda s: np.cos(np.sqrt(s)), 5, 0.0, _TURN_END, polynomial
 def expand_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0) -> Scalar:
     """Expand sin(x + ahead π/2) to basic arithmetic, equal on every machine.
 
-    If the graph's numbers are finite, |x| is at most 10⁴; otherwise any number.
+    If the graph's numbers are finite, |x| is at most 10⁴; otherwise any number. The result is NaN
+    for a float32 from 2⁵⁰ on.
     """
     # Reduce the angle to r = x - turns π/2, with |r| at most π/4.
     do, number = graph.apply, dtype.type
@@ -107,9 +108,9 @@ def expand_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0) ->
         assert isinstance(x, Expr)
         turns, r = graph.once("angle", x, functools.partial(_any_angle, graph, x))
     else:
-        # Beyond, neighbouring numbers are thousands of turns apart; infinity becomes NaN.
+        # From 2⁵⁰ on, the remainder would be wrong; a branch for those would slow all others down.
         is_angle = do("lt", do("abs", x), np.float32(2**50))
-        x = graph.select(is_angle, do("mul", x, np.float32(0)), x)
+        x = graph.select(is_angle, np.float32(np.nan), x)
         turns, r = do("quarter_turns", x), do("angle_rest", x)
     s = do("mul", r, r)
 

@@ -71,6 +71,11 @@ MAX_PROGRAM_OPERATIONS = 100_000
 _GRAPH_RULES = {**ARITHMETIC_RULES, **RANDOM_RULES, **DYNAMIC_RULES}
 """Lowering rules that take the graph before the equation and its operands."""
 
+_NO_RULE = {
+    "onekernel": "a step of fuse_mjx within a loop, a branch or a function: call it outside"
+}
+"""What is said of operations without a rule whose names say little."""
+
 _FLOAT = np.dtype(np.float32)
 
 _PACKAGE = str(Path(__file__).parents[1]) + os.sep
@@ -377,7 +382,7 @@ class _JaxprLowering:
         if rule is None and _is_expandable(equation):
             rule = self._expand
         if rule is None:
-            raise UnsupportedError(f"the operation {name}")
+            raise UnsupportedError(_NO_RULE.get(name, f"the operation {name}"))
         result = rule(equation, *operands)
         return result if isinstance(result, list) else [result]
 

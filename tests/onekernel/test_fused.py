@@ -16,7 +16,7 @@ from jetbot_mjx.envs.build import make_env
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.wrappers import EpisodeWrapper, NewEpisodeWrapper, wrap_for_training
 from jetbot_mjx.packed import pack
-from onekernel import KernelError, cpu, fuse, gpu, kernel, traced
+from onekernel import KernelError, UnsupportedError, cpu, fuse, gpu, kernel, traced
 from onekernel.lower.jaxpr import scalarize
 
 LANES = cpu.host_processor().lanes
@@ -455,6 +455,12 @@ def test_around_physics_what_no_kernel_can_do_stays_as_it_is(name):
     agree(jax.jit(jax.vmap(one))(x), jax.vmap(function(stepped))(x), atol=5e-6)
     assert launches(jax.vmap(one), x) == kernels
     agree(one(x[0]), function(stepped)(x[0]), atol=5e-6)
+
+
+@pytest.mark.parametrize("function", [with_a_kernel_in_a_loop, with_a_kernel_in_a_function])
+def test_a_kernel_that_is_not_called_directly_is_told(function):
+    with pytest.raises(UnsupportedError, match=r"^a step of fuse_mjx within a loop, a branch or a"):
+        fuse(function(made()), on_unsupported="raise")(robots(1, 2)[0])
 
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (17, 2, 3), np.uint8)

@@ -303,6 +303,20 @@ def in_units(ours, exact):
     return np.abs(ours[normal] - exact[normal]) / np.spacing(np.abs(rounded[normal]))
 
 
+@pytest.mark.parametrize("name", ["sin", "cos", "tan"])
+def test_an_angle_has_the_right_sine_or_none(name, lanes):
+    rng = np.random.default_rng(0)
+    ends = [2.0**50, np.nextafter(np.float32(2**50), 0), 3.4e38, np.inf, np.nan]
+    x = np.float32([*2.0 ** rng.uniform(-3, 50, 20_000), *2.0 ** rng.uniform(50, 128, 999), *ends])
+    x *= rng.choice([-1, 1], len(x))
+    number = jax.ShapeDtypeStruct((), np.float32)
+    (ours,) = run(scalarize(getattr(jnp, name), number, finite=False), [x])
+    is_far = ~(np.abs(x) < 2.0**50)
+    assert np.isnan(ours[is_far]).all()
+    exact = getattr(np, name)(x[~is_far].astype(np.float64))
+    assert in_units(ours[~is_far], exact).max() <= 4
+
+
 def directions():
     """Vectors of all sizes and directions, and next to the axes and the diagonals."""
     rng = np.random.default_rng(0)

@@ -257,8 +257,9 @@ def test_wrong_arguments_are_named():
     model = mujoco.MjModel.from_xml_string(FALLS)
     with pytest.raises(TypeError, match=r"mj_model is a str, not a mujoco\.MjModel"):
         fuse_mjx("hopper.xml")
-    with pytest.raises(ValueError, match="n_substeps is 0"):
-        fuse_mjx(model, 0)
+    for wrong in (0, 1.5, True, "2"):
+        with pytest.raises(ValueError, match=f"n_substeps is {wrong!r}, not a whole number"):
+            fuse_mjx(model, wrong)
     with pytest.raises(ValueError, match="'never', not warn, xla or raise"):
         fuse_mjx(model, on_unsupported="never")
 

@@ -697,6 +697,10 @@ def test_an_environment_is_measured_by_kernels_and_by_xla(tmp_path, monkeypatch,
     assert (row["environment"], row["num_envs"]) == ("mine", 64)
     assert row["ratio"] == pytest.approx(row["kernels"] / row["xla"])
     assert "| mine | 64 |" in capsys.readouterr().out
+    # Without `--output`, the file of the libraries stays as it is.
+    monkeypatch.setattr(environments, "default_output", lambda _: tmp_path / "stored.json")
+    assert environments.main([str(mine), *given[:-2]]) == 0
+    assert not (tmp_path / "stored.json").exists()
     # A library that is not installed is skipped, and an environment that gets lost is told.
     absent = {"absent": {"environment": "not_installed_anywhere:make"}}
     monkeypatch.setattr(environments, "LIBRARIES", absent)
@@ -753,3 +757,18 @@ def test_robots_are_compared_with_c_mujoco_under_the_same_commands(friction, mon
 def test_robots_that_end_far_away_have_to_be_explained(changed, right):
     row = robot_fidelity.Row("one", None, 0.01, 0.1, 1.0, 500.0, ())
     assert row._replace(**changed).is_right is right
+
+
+def test_what_is_measured_of_other_robots_is_stored_where_one_says(tmp_path, monkeypatch):
+    row = robot_fidelity.Row("one", None, 0.01, 0.1, 1.0, 500.0, ())
+    monkeypatch.setattr(robot_fidelity, "RESULTS", tmp_path)
+    monkeypatch.setattr(
+        robot_fidelity, "make_jetbot_env", lambda config: argparse.Namespace(blind=list)
+    )
+    monkeypatch.setattr(robot_fidelity, "measure", lambda *_: row)
+    stored, mine = tmp_path / "robot-fidelity-cpu.json", tmp_path / "mine.json"
+    assert robot_fidelity.main(["rover"]) == 0
+    assert robot_fidelity.main(["rover", "--output", str(mine)]) == 0
+    assert [*tmp_path.iterdir()] == [mine]
+    assert robot_fidelity.main([]) == 0
+    assert len(json.loads(stored.read_text())["fidelity"]) == 10

@@ -556,8 +556,6 @@ def test_a_command_of_the_pages_is_one(page, words, reader, monkeypatch):
         case ["python", "-m", module, *arguments]:
             check_arguments(COMMANDS[module.removeprefix("jetbot_mjx.")], arguments, monkeypatch)
         case ["python", script, *arguments] if script.startswith("examples/"):
-            if "sb3" in script:
-                pytest.importorskip("stable_baselines3")
             check_arguments(load(Path(script)), arguments, monkeypatch)
         case ["python", "-c", source]:
             compile(source, page, "exec")

@@ -1,6 +1,12 @@
-"""The example of a new task: it loads by name, behaves as described, and trains."""
+"""The example of a new task: it loads by name, behaves as described, and trains.
+
+And those of Stable-Baselines3 say that they need it.
+"""
 
 import json
+import re
+import runpy
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -200,3 +206,17 @@ def test_training_and_evaluation_run_end_to_end(load, env, tmp_path):
 def test_the_larger_examples_reach_nine_tenths(name, tmp_path):
     session.run(load_config(name), tmp_path / "run")
     assert evaluate_run(tmp_path / "run").policy.success_rate >= 0.9
+
+
+@pytest.mark.parametrize("name", ["sb3_train", "sb3_eval"])
+def test_what_an_example_needs_is_told(name, root, monkeypatch, capsys):
+    for package in ("stable_baselines3", "torch", "gymnasium"):
+        monkeypatch.setitem(sys.modules, package, None)
+    for argument, code in (([], 2), (["--help"], 0)):
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *argument])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(root / "examples" / f"{name}.py"), run_name="__main__")
+        assert ended.value.code == code
+    told = capsys.readouterr()
+    assert re.fullmatch(rf"error: {name}\.py needs .*: pip install .*sb3\].*\n", told.err)
+    assert f"usage: {name}.py" in told.out
