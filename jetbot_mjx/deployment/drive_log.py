@@ -124,7 +124,7 @@ def read_log(path: Path) -> DriveLog:
             f"{path} is not a log of deploy/drive.py: line {number}: {_reason(error)}"
         ) from None
     if len(poses) < _LEAST_POSES:
-        raise UserError(f"{path} has {len(poses)} poses: there is nothing to compare")
+        raise UserError(f"{path} has {len(poses) or 'no'} pose: there is nothing to compare")
     return DriveLog(
         path=path,
         header=header,
@@ -219,15 +219,22 @@ def _parse_goal(header: JsonObject) -> tuple[float, float] | None:
     return x, y
 
 
+def _object(value: Any, name: str) -> JsonObject:
+    if not isinstance(value, dict):
+        raise ValueError(f"its {name} is {shown(value)}, not an object")
+    return value
+
+
 def _parse_calibration(header: JsonObject) -> MotorModel:
     if header["format"] != FORMAT:
         raise ValueError(f"its format is {shown(header['format'])}, not {FORMAT!r}")
-    values = header["calibration"]
-    left, right = (_number(values[side]["dead_band"]) for side in ("left", "right"))
+    values = _object(header["calibration"], "calibration")
+    sides = [_object(values[side], f"calibration's {side}") for side in ("left", "right")]
+    left, right = (_number(side["dead_band"]) for side in sides)
     if not max(left, right) < 1:
         raise ValueError(f"a dead-band of {max(left, right):g} leaves no speed")
     # The log has the speed of a wheel's rim [m/s].
-    rims = (_number(values[side]["full_speed"], 0.0, 100.0) for side in ("left", "right"))
+    rims = (_number(side["full_speed"], 0.0, 100.0) for side in sides)
     fastest_left, fastest_right = (rim / ROLLING_RADIUS for rim in rims)
     full_speed = fastest_left, fastest_right
     return MotorModel((left, right), full_speed, lag=_number(values["lag"], 0.0), delay=0.0)

@@ -254,7 +254,7 @@ def _contact_hint(model: mujoco.MjModel) -> Iterator[str]:
     pairs = sum(_may_touch(model, one, other) for one, other in itertools.combinations(own, 2))
     idle = [x for x in own if _may_touch(model, floor, x) and x not in data.contact.geom]
     names = ", ".join(model.geom(x).name.removeprefix(PREFIX) or "a geom" for x in idle[:3])
-    parts = [f"{pairs} pairs of the robot's own parts"] * bool(pairs)
+    parts = [f"{pairs} pair{'s' * (pairs > 1)} of the robot's own parts"] * bool(pairs)
     parts += [f"{names}{' and others' * (len(idle) > 3)} with the floor"] * bool(idle)
     if parts:
         yield (

@@ -109,6 +109,12 @@ def test_needless_contacts_are_told(checked, tmp_path):
     touches += [('<geom name="head"', '<geom name="head" contype="1"')]
     printed = checked(copy_robot(tmp_path, "rover", touches))
     assert said + "6 pairs of the robot's own parts and of head with the floor" in printed
+    tyres = [
+        (f'"front_{side}_tyre"', f'"front_{side}_tyre" {own}')
+        for side, own in (("left", 'contype="3"'), ("right", 'conaffinity="2"'))
+    ]
+    printed = checked(copy_robot(tmp_path, "rover", tyres))
+    assert said + "1 pair of the robot's own parts, which costs" in printed
 
 
 def test_a_jetbot_that_cannot_drive_is_refused_before_it_is_trained():

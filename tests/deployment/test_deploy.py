@@ -853,6 +853,11 @@ def test_a_log_is_told_in_metrics_and_a_plot(driven, tmp_path, capsys):
     assert (tmp_path / "drive.sim2real.png").read_bytes()[1:4] == b"PNG"
 
 
+def header(lines, **changes):
+    """The first line, changed."""
+    return json.dumps({**json.loads(lines[0]), **changes})
+
+
 def later(lines, **changes):
     """The last line, changed."""
     return json.dumps({**json.loads(lines[-1]), **changes})
@@ -866,7 +871,10 @@ def later(lines, **changes):
         (lambda lines: [lines[0].replace("drive/1", "drive/9"), *lines[1:]], "its format is"),
         (lambda lines: [*lines[:5], "rubbish", *lines[5:]], "line 6"),
         (lambda lines: [*lines[:5], '{"t": 1}', *lines[5:]], "line 6: lacks 'motors'"),
-        (lambda lines: lines[:1], "has 0 poses"),
+        (lambda lines: lines[:1], "has no pose:"),
+        (lambda lines: lines[:2], "has 1 pose:"),
+        (lambda lines: [header(lines, calibration=None)], "its calibration is None, not an obj"),
+        (lambda lines: [header(lines, calibration={"left": 1})], "its calibration's left is 1, no"),
         (lambda lines: [lines[0], *lines[:0:-1]], "its times do not ascend"),
         (lambda lines: [*lines, later(lines, t=1e3)], "a drive writes one at least every 10 s"),
         (lambda lines: [*lines, later(lines, x=1e999)], "inf is not a number from -1e"),
