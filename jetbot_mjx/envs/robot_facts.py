@@ -3,7 +3,7 @@
 import itertools
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -14,7 +14,7 @@ from jetbot_mjx.config import MjcfRobotConfig, RobotConfig
 from jetbot_mjx.envs.adapted_env import AdaptedEnv
 from jetbot_mjx.envs.drive import AckermannDrive, DifferentialDrive, OwnDrive
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.mjcf_robot import PREFIX
+from jetbot_mjx.envs.mjcf_robot import PREFIX, load_spec
 from jetbot_mjx.envs.robot_trial import Trial, drive_trial, trial_turn
 from jetbot_mjx.envs.task import reach_on_floor
 from jetbot_mjx.envs.wrappers import wrap_for_training
@@ -73,8 +73,7 @@ def describe_robot(env: JetBotEnv) -> Iterator[tuple[str, str]]:
         yield "turn", f"{trial.turn:.0%} of the yaw rate that is commanded"
     if (reach := reach_on_floor(env.task, height)) is not None:
         yield "goals", f"reached within {1e3 * reach:.3g} mm on the floor"
-    follows = [*_speed_hint(env, trial, _WELL)] or _turn_hint(env, trial, _WELL)
-    for hint in (*follows, *_goal_hints(env, trial), *_simulation_hints(env)):
+    for hint in (*_driving_hints(env, trial, _WELL), *_simulation_hints(env)):
         yield "hint", hint
 
 
@@ -92,8 +91,46 @@ def training_hints(env: JetBotEnv) -> list[str]:
         trial = drive_trial(env.config, env.physics.mj_model, env.drive)
     if trial is None:
         return []
-    follows = [*_speed_hint(env, trial, _BADLY)] or _turn_hint(env, trial, _BADLY)
-    return [*follows, *_goal_hints(env, trial), *_simulation_hints(env)]
+    return [*_driving_hints(env, trial, _BADLY), *_simulation_hints(env)]
+
+
+def _driving_hints(env: JetBotEnv, trial: Trial, least: float) -> Sequence[str]:
+    """Return what would make a robot follow its commands, and reach its goals.
+
+    Args:
+      env: one environment, unwrapped.
+      trial: how the robot follows its commands.
+      least: the share by which its speed or turn may differ without a hint.
+    """
+    if slow := [*_slow_hint(env, trial)]:
+        return slow
+    follows = [*_speed_hint(env, trial, least)] or _turn_hint(env, trial, least)
+    return [*follows, *_goal_hints(env, trial)]
+
+
+def _slow_hint(env: JetBotEnv, trial: Trial) -> Iterator[str]:
+    """Yield what may hold a robot of a model, which is far slower than it is told.
+
+    Args:
+      env: one environment, unwrapped.
+      trial: how the robot follows its commands.
+    """
+    if not isinstance(env.robot, MjcfRobotConfig) or trial.speed >= 1.0 - _BADLY:
+        return
+    model = env.physics.mj_model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    driven = {model.jnt_bodyid[model.actuator_trnid[i, 0]] for i in range(model.nu)}
+    drags = [
+        f"{model.geom(max(x.geom)).name.removeprefix(PREFIX) or 'a geom'} ({x.friction[0]:g})"
+        for x in data.contact
+        if model.geom_bodyid[max(x.geom)] not in driven
+    ]
+    touching = f" (beside the wheels, with their friction: {', '.join(drags[:3])})" * bool(drags)
+    yield (
+        f"the robot drives with {trial.speed:.0%} of the speed that is commanded: its wheels slip,"
+        f" its motors are too weak, or a part drags on the floor{touching}"
+    )
 
 
 def _speed_hint(env: JetBotEnv, trial: Trial, least: float) -> Iterator[str]:
@@ -189,7 +226,10 @@ def _simulation_hints(env: JetBotEnv) -> Iterator[str]:
     model, drive = env.physics.mj_model, env.drive
     if isinstance(drive, DifferentialDrive | AckermannDrive):
         yield from _motor_hint(model, drive)
-    yield from _mesh_hint(model)
+    if isinstance(env.robot, MjcfRobotConfig):
+        yield from _mesh_hint(model)
+        if load_spec(env.robot).option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+            yield "contacts have a pyramidal cone in training, not the elliptic one of the model"
     yield from _contact_hint(model)
 
 
@@ -270,7 +310,7 @@ def _may_touch(model: mujoco.MjModel, one: int, other: int) -> bool:
     related = bool(bodies.min()) and (bodies[0] == parents[1] or bodies[1] == parents[0])
     types, affinities = model.geom_contype[[one, other]], model.geom_conaffinity[[one, other]]
     meets = bool((types & affinities[::-1]).any())
-    return meets and bodies[0] != bodies[1] and not related
+    return meets and bool(bodies[0] != bodies[1]) and not related
 
 
 def step_rate(env: JetBotEnv | AdaptedEnv, instances: int) -> float:

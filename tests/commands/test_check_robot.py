@@ -195,3 +195,23 @@ def test_a_mesh_that_may_touch_the_floor_is_told(checked, tmp_path):
         changes = [asset, ('<geom name="head"', head.format(extra))]
         printed = checked(copy_robot(folder, "rover", changes))
         assert ("where nose touches the floor, MJX has other points" in printed) == expected
+
+
+WEAK = ('kv="0.08"', 'kv="0.025"')
+
+
+def test_of_a_robot_that_drags_nothing_else_is_told(checked, tmp_path):
+    smooth = 'size="0.01" friction="0.001" priority="1" condim="1"'
+    rough = smooth.replace("0.001", "0.9").replace('condim="1"', 'condim="3"')
+    printed = checked(copy_robot(tmp_path, "turtlebot", [(smooth, rough), WEAK]))
+    assert re.search(r"drives with \d\d% of the speed that is commanded: .* ball \(0.9\)", printed)
+    assert "robot.wheel_separation" not in printed
+    assert "episode_length" not in printed
+
+
+def test_an_elliptic_cone_is_told_to_be_a_pyramidal_one(checked, tmp_path):
+    for cone in ("elliptic", "pyramidal"):
+        (folder := tmp_path / cone).mkdir()
+        change = [("<worldbody>", f'<option cone="{cone}"/><worldbody>')]
+        printed = checked(copy_robot(folder, "turtlebot", change))
+        assert ("not the elliptic one" in printed) == (cone == "elliptic")
