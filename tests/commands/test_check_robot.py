@@ -197,7 +197,7 @@ def test_a_mesh_that_may_touch_the_floor_is_told(checked, tmp_path):
         assert ("where nose touches the floor, MJX has other points" in printed) == expected
 
 
-WEAK = ('kv="0.08"', 'kv="0.025"')
+WEAK = ('kv="0.08"', 'kv="0.02"')
 
 
 def test_of_a_robot_that_drags_nothing_else_is_told(checked, tmp_path):
