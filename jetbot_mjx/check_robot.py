@@ -76,6 +76,10 @@ def _config(file: Path, overrides: Sequence[str]) -> Config:
                 f"{file}: no actuators turn wheels on both sides: give a configuration that names"
                 " them, as `robot: {file: …, wheels: {left: […], right: […]}}`"
             )
+        if '""' in json.dumps(section):
+            raise UserError(
+                f'{file}: an actuator of a wheel has no name: give each one, as <velocity name="…"'
+            )
         cli.tell(f"robot: {json.dumps(section)}")
         return load_config(parse_config({"robot": {**section, "file": str(file)}}), overrides)
     if not file.suffix or (file.suffix in YAML_ENDINGS and "robot" in read_yaml(file)):

@@ -13,7 +13,8 @@ from jetbot_mjx.config.section import Section
 from jetbot_mjx.config.value_types import integral
 from jetbot_mjx.errors import shown
 
-Names = Annotated[tuple[str, ...], Field(strict=False, max_length=16)]
+Name = Annotated[str, Field(min_length=1)]
+Names = Annotated[tuple[Name, ...], Field(strict=False, max_length=16)]
 
 MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")
 """Endings of files of a model; what holds URDF is refused with what to do."""

@@ -37,6 +37,9 @@ _DAMPED = 0.6
 _OVERSHOOTS = 2.0
 """Time steps per time constant of a motor from which Euler's method is unstable."""
 
+_VEERS = 0.03
+"""Yaw rate straight ahead from which a robot's sides are said to differ [rad/s]."""
+
 _BADLY = 0.3
 """Share from which a training is told so."""
 
@@ -102,8 +105,8 @@ def _driving_hints(env: JetBotEnv, trial: Trial, least: float) -> Sequence[str]:
       trial: how the robot follows its commands.
       least: the share by which its speed or turn may differ without a hint.
     """
-    if slow := [*_slow_hint(env, trial)]:
-        return slow
+    if held := [*_slow_hint(env, trial), *_veer_hint(env, trial)]:
+        return held
     follows = [*_speed_hint(env, trial, least)] or _turn_hint(env, trial, least)
     return [*follows, *_goal_hints(env, trial)]
 
@@ -129,8 +132,24 @@ def _slow_hint(env: JetBotEnv, trial: Trial) -> Iterator[str]:
     touching = f" (beside the wheels, with their friction: {', '.join(drags[:3])})" * bool(drags)
     yield (
         f"the robot drives with {trial.speed:.0%} of the speed that is commanded: its wheels slip,"
-        f" its motors are too weak, or a part drags on the floor{touching}"
+        f" its motors are too weak, a joint's damping or an equality holds it, or a part drags on"
+        f" the floor{touching}"
     )
+
+
+def _veer_hint(env: JetBotEnv, trial: Trial) -> Iterator[str]:
+    """Yield that a robot of a model does not drive straight ahead.
+
+    Args:
+      env: one environment, unwrapped.
+      trial: how the robot follows its commands.
+    """
+    if isinstance(env.robot, MjcfRobotConfig) and abs(trial.veer) > _VEERS:
+        yield (
+            f"told to drive straight ahead, the robot turns by {math.degrees(trial.veer):.0f}°"
+            " each second: its sides differ, as by a wheel that drags or has no motor, or by the"
+            " centre of mass"
+        )
 
 
 def _speed_hint(env: JetBotEnv, trial: Trial, least: float) -> Iterator[str]:

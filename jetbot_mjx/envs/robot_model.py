@@ -229,9 +229,15 @@ def _settle(spec: mujoco.MjSpec) -> None:
         if fastest <= 1e-3:
             break
     else:
+        below = data.body(robot_body(model)).xpos[2] < 0.0
+        reason = (
+            "it falls through the floor: no wheel collides with that (contype, conaffinity)"
+            if below
+            else "it falls over, or something pushes it"
+        )
         raise RuntimeError(
             f"the robot does not come to rest: after {_MOST_RESTS * _REST:g} s it moves with up to"
-            f" {fastest:.3g} m/s or rad/s: it falls over, or something pushes it"
+            f" {fastest:.3g} m/s or rad/s: {reason}"
         )
     # Keep only height and pitch: the robot may have crept along the floor.
     body = spec.body(robot_body(model))

@@ -36,6 +36,8 @@ class Trial(NamedTuple):
     """Speed straight ahead as a share of the commanded one."""
     turn: float
     """Yaw rate, or curvature of a car's path, as a share of the commanded one, in a slow curve."""
+    veer: float
+    """Yaw rate straight ahead [rad/s]: 0 of a robot whose sides are alike."""
 
 
 def drive_trial(config: Config, model: mujoco.MjModel, drive: Drive) -> Trial | None:
@@ -77,7 +79,7 @@ def drive_trial(config: Config, model: mujoco.MjModel, drive: Drive) -> Trial | 
             f"told to turn half as fast as it may, it turns {turn:.2g} times as fast: a joint or"
             " another part holds it, or the wheels are too far apart for their grip",
         )
-    return Trial(share, turn)
+    return Trial(share, turn, float(ahead[half:, 2].mean()))
 
 
 def trial_turn(model: mujoco.MjModel, drive: DifferentialDrive | AckermannDrive) -> float:

@@ -215,3 +215,34 @@ def test_an_elliptic_cone_is_told_to_be_a_pyramidal_one(checked, tmp_path):
         change = [("<worldbody>", f'<option cone="{cone}"/><worldbody>')]
         printed = checked(copy_robot(folder, "turtlebot", change))
         assert ("not the elliptic one" in printed) == (cone == "elliptic")
+
+
+def test_a_robot_that_does_not_drive_straight_is_told(checked, tmp_path):
+    hint = re.compile(r"told to drive straight ahead, the robot turns by (-?\d+)° each second")
+    joint = '<joint name="rear_left"'
+    for extra in ("", ' frictionloss="1.1"'):
+        (folder := tmp_path / f"{len(extra)}").mkdir()
+        printed = checked(copy_robot(folder, "rover", [(joint, joint + extra)]))
+        found = hint.search(printed)
+        assert bool(found) == bool(extra)
+    # To the left, whose wheel drags.
+    assert int(found[1]) > 2
+    assert "robot.wheel_separation" not in printed
+
+
+def test_actuators_without_names_are_named(tmp_path, capsys):
+    text = (EXAMPLES / "turtlebot.xml").read_text("utf-8")
+    for names in ((' name="left"', ' name="right"'), (' name="left"',)):
+        changed = text
+        for name in names:
+            changed = changed.replace(f"<velocity{name}", "<velocity")
+        (tmp_path / "robot.xml").write_text(changed, "utf-8")
+        with pytest.raises(UserError, match="an actuator of a wheel has no name: give each one"):
+            check_robot.main([str(tmp_path / "robot.xml")])
+
+
+def test_a_robot_that_falls_through_the_floor_is_told_so(checked, tmp_path):
+    through = [('class="touches" type="sphere"', 'type="sphere" contype="0"')]
+    config = copy_robot(tmp_path, "turtlebot", through, {"wheel_radius": 0.033})
+    with pytest.raises(UserError, match="it falls through the floor: no wheel collides"):
+        checked(config)
