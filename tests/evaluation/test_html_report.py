@@ -227,6 +227,22 @@ def test_that_success_depends_on_the_simulator_is_told_where_intervals_do_not_ov
     assert said not in summarize_report(report)
 
 
+@pytest.mark.parametrize(
+    ("rates", "said"),
+    [
+        ((0.5, 0.97, 1.0), ("stays at 95% or above", "1 to 2", "50.0% at 0.5")),
+        ((0.5, 0.9, 0.4), ("is below 95% already at the preset", "  -  ", "40.0% at 2")),
+    ],
+)
+def test_each_parameter_has_its_range_and_its_least_success(tmp_path, rates, said):
+    report = report_of(tmp_path, np.ones(6))
+    sweep = SWEEPS[0]._replace(values=(0.5, 1.0, 2.0), nominal=1.0)
+    policy = tuple(report.policy._replace(success_rate=rate) for rate in rates)
+    told = summarize_report(report._replace(robustness=(SweepResult(sweep, policy, policy),)))
+    for text in said:
+        assert text in told
+
+
 def costing(report, cost):
     """A report whose task costs so much in each step [m]."""
     task = report.config.task.model_copy(update={"step_cost": cost})
