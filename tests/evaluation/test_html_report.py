@@ -236,7 +236,7 @@ def test_that_success_depends_on_the_simulator_is_told_where_intervals_do_not_ov
 )
 def test_each_parameter_has_its_range_and_its_least_success(tmp_path, rates, said):
     report = report_of(tmp_path, np.ones(6))
-    sweep = SWEEPS[0]._replace(values=(0.5, 1.0, 2.0), nominal=1.0)
+    sweep = SWEEPS[0]._replace(values=(0.5, 1.0, 2.0))
     policy = tuple(report.policy._replace(success_rate=rate) for rate in rates)
     told = summarize_report(report._replace(robustness=(SweepResult(sweep, policy, policy),)))
     for text in said:
