@@ -1,7 +1,7 @@
 """Let a box touch the floor with each corner below it, as in C MuJoCo.
 
 MJX keeps the corners within 1 mm of the deepest. A chassis that tips onto its front edge then
-stands on one corner where C MuJoCo has two, and differs from it by 1 rad/s after a physics step.
+stands on one corner where C MuJoCo has two, and turns otherwise.
 """
 
 import contextlib
