@@ -78,7 +78,8 @@ def _config(file: Path, overrides: Sequence[str]) -> Config:
             )
         if '""' in json.dumps(section):
             raise UserError(
-                f'{file}: an actuator of a wheel has no name: give each one, as <velocity name="…" …>'
+                f"{file}: an actuator of a wheel has no name: give each one, as"
+                ' <velocity name="…" …>'
             )
         cli.tell(f"robot: {json.dumps(section)}")
         return load_config(parse_config({"robot": {**section, "file": str(file)}}), overrides)
