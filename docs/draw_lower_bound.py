@@ -13,7 +13,7 @@ from benchmarks.learning.reachable import Grid, Limits, farthest
 from jetbot_mjx.evaluation.best_known import BOUND_FILE, FILE
 
 TIMES = (0.5, 1.0, 1.5)  # [s]
-GRID = Grid(1, 72)
+GRID = Grid(4, 72)
 
 
 def of_isaac(searches: list[dict]) -> dict:

@@ -249,14 +249,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     took = np.where(episodes.success > 0, episodes.steps, np.inf).reshape(options.goals, starts)
     place = took.argmin(axis=1) + np.arange(options.goals) * starts
     found = took.min(axis=1)
-    known = find("search", env.config, jax.tree.map(lambda x: x[place], episodes))
-    if isinstance(known, str):
-        raise UserError(known)
+    chosen = jax.tree.map(lambda x: x[place], episodes)
+    known, bound = (find(kind, env.config, chosen) for kind in ("search", "bound"))
+    if isinstance(known, str) or isinstance(bound, str):
+        raise UserError(str(known if isinstance(known, str) else bound))
     ratio = found / known
     print(
         f"{(ratio <= 1.01).sum()} of {options.goals} goals within 1 % of the best known time,"
         f" {(ratio < 1).sum()} sooner; reached: {np.isfinite(found).sum()}, median"
         f" {np.median(ratio) - 1:+.2%}, worst {ratio.max() - 1:+.2%}"
+    )
+    print(
+        f"{(found == bound).sum()} as soon as physics allows at all, {(found < bound).sum()} sooner"
+        " (which would prove the bound wrong)"
     )
     return 0
 

@@ -19,12 +19,17 @@ from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ, DifferentialDrive, JetBotEnv, P
 MARGIN = 1.005
 """Factor between the largest measured value and the limit."""
 
-MARGIN_OF_SPEED = 1.003
-"""The same for speeds, which the motors' controller holds closely."""
+_MARGIN_OF_SPEED = 1.003  # the same for speeds, which the motors' controller holds closely
 
 _MARGIN_OF_ERROR = 1.2
-GROWTH = 0.9  # [rad/s²] by which |ω| may grow faster than by the drift
-_SPIN = 1.5  # largest yaw rate with limits, as a multiple of the commanded one; then wheels slip
+
+# Chosen; `Limits.error` is measured with them.
+GROWTH = 0.45  # [rad/s²] by which |ω| may grow faster than by the drift
+_SPIN = 1.9  # largest yaw rate with limits, as a multiple of the commanded one
+_TURN = 1.4  # largest v |ω| with limits, as a multiple of that of the commanded speeds
+_DRIVEN = 0.1  # of the largest change of the yaw rate: more is that of motors
+_SHARE = 0.977  # of the largest measured change of speed, which lasts for single steps only
+_OUTER_LOSS, _INNER_LOSS = 1.0, 0.6  # of `Limits.slip`
 
 
 class Motion(NamedTuple):
@@ -38,6 +43,8 @@ class Motion(NamedTuple):
     """Speed to the left [m/s]."""
     yaw_rate: Float[np.ndarray, "n t"]
     """Yaw rate [rad/s]."""
+    heading: Float[np.ndarray, "n t"]
+    """Angle of the robot's front to the x axis [rad]."""
 
 
 def random_actions(seed: int, count: int, steps: int, size: int = 2) -> np.ndarray:
@@ -98,7 +105,7 @@ def motion(qpos: Float[np.ndarray, "n t nq"], qvel: Float[np.ndarray, "n t nv"])
     (vx, vy), (wx, wy, wz) = np.moveaxis(qvel[..., :2], -1, 0), np.moveaxis(qvel[..., 3:6], -1, 0)
     turning = 2 * (x * z - w * y) * wx + 2 * (y * z + w * x) * wy + (1 - 2 * (x * x + y * y)) * wz
     ahead, left = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx
-    return Motion(qpos[..., QPOS_XYZ], ahead, left, turning)
+    return Motion(qpos[..., QPOS_XYZ], ahead, left, turning, yaw)
 
 
 class Inertia(NamedTuple):
@@ -149,17 +156,55 @@ def sides(constants: Inertia, moved: Motion, ctrl_dt: float) -> Float[np.ndarray
     return np.stack([grown + turned - swing + drag, grown - turned + swing + drag])
 
 
+def follow(moved: Motion, limits: Limits) -> Motion:
+    """Return drives that keep to limits of torque and motors, and follow others closely."""
+    dt, track, most = limits.ctrl_dt, limits.track, limits.step
+    right, left = moved.speed + track * moved.yaw_rate, moved.speed - track * moved.yaw_rate
+    speed, yaw_rate = np.zeros_like(right), np.zeros_like(right)
+    p, q = right[:, 0], left[:, 0]
+    for t in range(1, right.shape[1]):
+        # The drift.
+        v, w = (p + q) / 2, (p - q) / 2 / track
+        sign, lost = np.sign(w), np.maximum(v, 0) * w**2
+        swing = limits.swing * v * w * track
+        outer, inner = limits.outer_loss * lost, limits.inner_loss * lost
+        grows = 2 * track * limits.growth * (np.abs(w) > limits.motor_yaw_rate)
+        slowed = limits.drag * w**2
+        p = p + dt * (swing - slowed - np.where(sign > 0, outer, inner) + grows * (sign > 0))
+        q = q + dt * (-swing - slowed - np.where(sign < 0, outer, inner) + grows * (sign < 0))
+        # The torque that comes closest; it does not raise |ω| beyond the motors' yaw rate.
+        a = np.clip(right[:, t] - p, -limits.brake * most, most)
+        b = np.clip(left[:, t] - q, -limits.brake * most, most)
+        room = np.maximum(2 * track * limits.motor_yaw_rate - np.abs(p - q), 0)
+        beyond = np.sign(p - q) * np.maximum(np.sign(p - q) * (a - b) - room, 0) / 2
+        p, q = p + a - beyond, q + b + beyond
+        speed[:, t], yaw_rate[:, t] = (p + q) / 2, (p - q) / 2 / track
+    return moved._replace(speed=speed, yaw_rate=yaw_rate)
+
+
 def path(moved: Motion, limits: Limits) -> Float[np.ndarray, "n t 2"]:
     """Return the positions that follow from speeds and yaw rates alone [m]."""
-    dt, late = limits.ctrl_dt, limits.lateness
-    v, w = moved.speed, moved.yaw_rate
-    turns = dt * ((1 - late) * w[:, :-1] + late * w[:, 1:])
-    heading = np.concatenate([np.zeros_like(w[:, :1]), np.cumsum(turns, axis=1)], axis=1)
-    aside = -limits.slip * v * w
-    cos, sin = np.cos(heading), np.sin(heading)
-    velocity = np.stack([v * cos - aside * sin, v * sin + aside * cos], axis=-1)
-    moves = dt * ((1 - late) * velocity[:, :-1] + late * velocity[:, 1:])
+    velocity = velocities(moved, limits)
+    moves = _steps(velocity, limits)
     return np.concatenate([np.zeros_like(velocity[:, :1]), np.cumsum(moves, axis=1)], axis=1)
+
+
+def velocities(moved: Motion, limits: Limits) -> Float[np.ndarray, "n t 2"]:
+    """Return the velocities on the floor that follow from speeds and yaw rates alone [m/s]."""
+    turns = _steps(moved.yaw_rate, limits)
+    heading = np.concatenate([np.zeros_like(turns[:, :1]), np.cumsum(turns, axis=1)], axis=1)
+    return _on_floor(moved.speed, -limits.slip * moved.speed * moved.yaw_rate, heading)
+
+
+def _steps(rate: np.ndarray, limits: Limits) -> np.ndarray:
+    """Return by how much each control step changes what has these rates at its ends."""
+    late = limits.lateness
+    return limits.ctrl_dt * ((1 - late) * rate[:, :-1] + late * rate[:, 1:])
+
+
+def _on_floor(ahead: np.ndarray, left: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    cos, sin = np.cos(heading), np.sin(heading)
+    return np.stack([ahead * cos - left * sin, ahead * sin + left * cos], axis=-1)
 
 
 def lateness(env: JetBotEnv) -> float:
@@ -189,42 +234,83 @@ def measure(env: JetBotEnv, whole: Motion) -> Limits | str:
     if isinstance(constants, str) or not isinstance(env.drive, DifferentialDrive):
         return str(constants)
     w, v = np.abs(whole.yaw_rate), whole.speed
-    # Beyond the largest yaw rate only the speed is limited, for the rest of the drive.
+    # Where it spins, only velocities are limited, for the rest of the drive.
     most = _SPIN * env.drive.max_yaw_rate
     spins = float(w.max()) > most
-    calm = np.maximum.accumulate(w, axis=1) <= most
-    before = calm[:, :-1]
-    # The motors' yaw rate is the largest that |ω| reaches faster than by the drift.
+    turn = _TURN * env.drive.max_yaw_rate * env.drive.max_speed if spins else np.inf
+    calm = within(whole, most, turn)
+    most_grown = float(sides(constants, whole, dt)[:, calm[:, :-1]].max())
+    # The motors' yaw rate is the largest that |ω| reaches clearly faster than by the drift.
     drifted = w[:, :-1] * (1 + max(constants.swing, 0) * np.maximum(v[:, :-1], 0) * dt)
-    driven = (w[:, 1:] > drifted + GROWTH * dt) & calm[:, 1:]
+    driven = (w[:, 1:] > drifted + _DRIVEN * most_grown / constants.track) & calm[:, 1:]
     motors = MARGIN * float(w[:, 1:][driven].max())
     if not spins:
         motors = most = max(motors, MARGIN * float(w.max()))
-    grown = sides(constants, whole, dt)
-    step = MARGIN * max(float(grown[:, before].max()), _growth_after(whole, ~calm))
+    step = MARGIN * max(_SHARE * most_grown, _growth_after(whole, ~calm))
     curve = v * w
     slip = -float((whole.sideways * v * whole.yaw_rate)[calm].sum() / (curve[calm] ** 2).sum())
     limits = Limits(
         ctrl_dt=dt,
         track=constants.track,
         step=step,
-        brake=MARGIN * max(1.0, float(-grown[:, before].min()) / step),
+        brake=1.0,
         swing=constants.swing,
         drag=constants.drag,
-        max_speed=MARGIN_OF_SPEED * float(v.max()),
-        min_speed=MARGIN * min(float(v[calm].min()), 0.0),
+        outer_loss=_OUTER_LOSS * slip,
+        inner_loss=_INNER_LOSS * slip,
+        max_speed=0.0,
+        min_speed=0.0,
         motor_yaw_rate=motors,
         growth=GROWTH if spins else 0.0,
         max_yaw_rate=most,
+        max_turn=turn,
+        grip=0.0,
         half_track=constants.half_track,
-        max_wheel_speed=MARGIN_OF_SPEED * float((v + constants.half_track * w)[calm].max()),
+        max_wheel_speed=0.0,
         lateness=lateness(env),
         slip=slip,
         error=0.0,
     )
-    apart = np.linalg.norm(path(whole, limits) - whole.position[..., :2], axis=-1) * calm
-    time = np.arange(apart.shape[1]) * dt
-    return limits._replace(error=_MARGIN_OF_ERROR * float((apart / (time + ERROR_TIME)).max()))
+    return _with_the_rest(whole, limits)
+
+
+def _with_the_rest(whole: Motion, limits: Limits) -> Limits:
+    """Return limits with those of speeds, the grip and the error, of drives that keep to them."""
+    # A drive within the limits follows each of the measured ones: how far are they apart?
+    near = follow(whole, limits)
+    calm = within(near, limits.max_yaw_rate, limits.max_turn)
+    apart = np.linalg.norm(path(near, limits) - whole.position[..., :2], axis=-1) * calm
+    time = np.arange(apart.shape[1]) * limits.ctrl_dt
+    wheel = near.speed + limits.half_track * np.abs(near.yaw_rate)
+    highest_speed = max(float(whole.speed.max()), float(near.speed[calm].max()))
+    return limits._replace(
+        max_speed=_MARGIN_OF_SPEED * highest_speed,
+        min_speed=MARGIN * min(float(near.speed[calm].min()), 0.0),
+        max_wheel_speed=_MARGIN_OF_SPEED * float(wheel[calm].max()),
+        grip=_MARGIN_OF_ERROR * _grip(whole, near, limits, calm),
+        error=_MARGIN_OF_ERROR * float((apart / (time + ERROR_TIME)).max()),
+    )
+
+
+def within(moved: Motion, max_yaw_rate: float, max_turn: float) -> Bool[np.ndarray, "n t"]:
+    """Return until when each drive keeps to the largest yaw rate, and v |ω| to its limit."""
+    w = np.abs(moved.yaw_rate)
+    return np.logical_and.accumulate((w <= max_yaw_rate) & (moved.speed * w <= max_turn), axis=1)
+
+
+def _grip(whole: Motion, near: Motion, limits: Limits, calm: Bool[np.ndarray, "n t"]) -> float:
+    """Return the acceleration on the floor, averaged since the robot spins [m/s²]."""
+    velocity, first = (
+        _on_floor(whole.speed, whole.sideways, whole.heading),
+        velocities(near, limits),
+    )
+    most = 0.0
+    for now, begin, here in zip(velocity, first, calm, strict=True):
+        start, time = int(here.sum()), limits.ctrl_dt * np.arange(1, here.size)
+        if start + 1 < here.size:
+            change = np.linalg.norm(now[start + 1 :] - begin[start], axis=-1)
+            most = max(most, float((change / time[: change.size]).max()))
+    return most
 
 
 def _growth_after(moved: Motion, spun: Bool[np.ndarray, "n t"]) -> float:

@@ -39,6 +39,11 @@ class Limits(NamedTuple):
     """κ [1/m] of the drift: ω grows by κ v ω per second without torque."""
     drag: float
     """[m] of the drift: v falls by `drag` ω² per second without torque."""
+    outer_loss: float
+    """[s] of the drift: in a turn the outer one of p and q falls by `outer_loss` v ω² per second,
+    because the wheels slip sideways."""
+    inner_loss: float
+    """[s] the same of the inner one."""
     max_speed: float
     """[m/s] largest v."""
     min_speed: float
@@ -48,8 +53,12 @@ class Limits(NamedTuple):
     growth: float
     """[rad/s²] by which |ω| may grow faster than by the drift where it is above."""
     max_yaw_rate: float
-    """[rad/s] yaw rate beyond which only the speed is limited; it is never reached where it equals
-    `motor_yaw_rate`."""
+    """[rad/s] yaw rate beyond which only velocities are limited; it is never reached where it
+    equals `motor_yaw_rate`."""
+    max_turn: float
+    """[m/s²] v |ω| beyond which only velocities are limited; infinite if it is never reached."""
+    grip: float
+    """[m/s²] by which the velocity on the floor may change, from then on."""
     half_track: float
     """[m] half of the distance of the wheels."""
     max_wheel_speed: float
@@ -106,13 +115,18 @@ class _Lattice:
         self.valid &= self.v + limits.half_track * np.abs(self.w) <= reach
         self.driven = np.abs(self.rank) <= ranks
         self.valid &= self.spins | self.driven
-        self.free = (np.abs(self.rank) >= free) & self.spins
-        # The drift of p and q, in steps of the lattice.
+        # A state between those of the lattice is free if one of its neighbours may be.
         sign, size = np.sign(self.w), np.abs(self.w)
+        beyond = size + width / 2 / self.track
+        self.free = (beyond > limits.max_yaw_rate) & self.spins
+        self.free |= (np.abs(self.v) + width) * beyond > limits.max_turn
+        # The drift of p and q, in steps of the lattice.
         swing, drag = limits.swing * self.v * s, limits.drag * self.w**2
+        lost = np.maximum(self.v, 0) * self.w**2
+        outer, inner = drag + limits.outer_loss * lost, drag + limits.inner_loss * lost
         grows = 2 * self.track * limits.growth * (size > limits.motor_yaw_rate + 1e-9)
-        self.drift_p = (swing - drag + grows * (sign > 0)) * dt / width
-        self.drift_q = (-swing - drag + grows * (sign < 0)) * dt / width
+        self.drift_p = (swing - np.where(sign > 0, outer, inner) + grows * (sign > 0)) * dt / width
+        self.drift_q = (-swing - np.where(sign < 0, outer, inner) + grows * (sign < 0)) * dt / width
 
 
 def _at(x: Float[np.ndarray, "q rank *rest"], p: int, q: int) -> Float[np.ndarray, "q rank *rest"]:
@@ -228,6 +242,34 @@ class _Turn:
         return result + fall
 
 
+class _Spun:
+    """A `_Spun` bounds how far robots get that spin: whose velocities alone are limited."""
+
+    def __init__(self, lattice: _Lattice, limits: Limits, grid: Grid) -> None:
+        angle = 2 * np.pi / grid.headings
+        headings = np.arange(grid.headings) * angle
+        self._limits, v, w = limits, lattice.v[lattice.free, None], lattice.w[lattice.free, None]
+        # Between the states of the lattice, velocities are larger by this at most.
+        apart = lattice.width * (1 + limits.slip * limits.max_yaw_rate)
+        apart += limits.max_speed * (angle / 2 + limits.slip * lattice.width / lattice.track)
+        self._along = v * np.cos(headings) + limits.slip * v * w * np.sin(headings) + apart
+        self._fast = np.abs(v) * np.hypot(1.0, limits.slip * w) + apart
+        self._way = self._speed(0) * limits.ctrl_dt
+
+    def _speed(self, step: int) -> np.ndarray:
+        """Return the largest speed in the direction after some steps, of each state [m/s]."""
+        gained = step * self._limits.grip * self._limits.ctrl_dt
+        speed = np.minimum(self._along + gained, self._fast + step * self._limits.step)
+        return np.minimum(speed, self._limits.max_speed)
+
+    def __call__(self, step: int) -> np.ndarray:
+        """Return the values of the states after `step` steps; call it for 1, 2, and so on."""
+        moved = self._speed(step) * self._limits.ctrl_dt
+        value = self._way + self._limits.lateness * moved
+        self._way = self._way + moved
+        return value.astype(np.float32)
+
+
 def farthest(limits: Limits, steps: int, grid: Grid) -> Float[np.ndarray, "t directions"]:
     """Compute upper bounds of how far a robot gets in each direction in a number of steps.
 
@@ -250,6 +292,7 @@ def farthest(limits: Limits, steps: int, grid: Grid) -> Float[np.ndarray, "t dir
     value = np.where(lattice.valid[..., None], limits.lateness * gain, _NEVER).astype(np.float32)
     start = -lattice.first, int(np.flatnonzero(lattice.rank == 0)[0])
     results = np.zeros((steps + 1, grid.headings))
+    spun_robot = _Spun(lattice, limits, grid)
     for t in range(steps):
         # Torque below the yaw rate of the motors: p and q change independently.
         wide = _best(np.where(spun, _NEVER, value), lattice.down, lattice.up, 1, 0)
@@ -260,14 +303,8 @@ def farthest(limits: Limits, steps: int, grid: Grid) -> Float[np.ndarray, "t dir
         value = drift_q(drift_p(wide))
         value = turn(value) + gain + np.float32(_ROUNDING)
         value[~lattice.valid] = _NEVER
-        # Beyond the largest yaw rate: as if the robot headed for the goal at once.
-        time = (t + 1.5) * dt
-        speed = np.abs(lattice.v) * np.hypot(1.0, limits.slip * limits.max_yaw_rate)
-        growing = np.clip((limits.max_speed - speed) / limits.step * dt, 0, time)
-        lost = limits.step / dt * growing**2 / 2
-        best = limits.max_speed * time - lost
-        far = lattice.valid & lattice.free
-        value[far] = np.maximum(value[far], best[far][:, None].astype(np.float32))
+        if lattice.free.any():
+            value[lattice.free] = np.maximum(value[lattice.free], spun_robot(t + 1))
         results[t + 1] = value[start] + limits.error * ((t + 1) * dt + ERROR_TIME)
     # The array is over the heading relative to the direction.
     return np.concatenate([results[:, :1], results[:, :0:-1]], axis=1)
