@@ -214,6 +214,18 @@ def _remove_visuals(spec: mujoco.MjSpec) -> None:
             spec.delete(body)
 
 
+def _lifted_wheel(model: mujoco.MjModel, data: mujoco.MjData) -> str | None:
+    """Return the name of the first body with a motor that touches nothing; None: all touch."""
+    touching = set(model.geom_bodyid[data.contact.geom].ravel().tolist())
+    driven = model.jnt_bodyid[model.actuator_trnid[:, 0]].tolist()
+    names = (
+        model.body(body).name.removeprefix(mjcf_robot.PREFIX)
+        for body in driven
+        if body not in touching
+    )
+    return next(names, None)
+
+
 def _settle(spec: mujoco.MjSpec) -> None:
     """Set the initial pose to the robot at rest, so that no episode starts with a drop."""
     model = spec.compile()
@@ -244,9 +256,14 @@ def _settle(spec: mujoco.MjSpec) -> None:
     body.pos = (0.0, 0.0, data.qpos[2])
     pitch = 2.0 * np.arcsin(data.qpos[5])
     if abs(pitch) > _LARGEST_LEAN:
+        lifted = _lifted_wheel(model, data)
+        remedy = (
+            "support it there, as by a caster closer to the floor"
+            if lifted is None
+            else f"its wheel {lifted!r} does not touch the floor: make it larger, or lower it"
+        )
         raise UserError(
             f"at rest the robot leans {np.degrees(abs(pitch)):.0f}° to the"
-            f" {'front' if pitch > 0 else 'rear'}: support it there, as by a caster closer to the"
-            " floor"
+            f" {'front' if pitch > 0 else 'rear'}: {remedy}"
         )
     body.quat = (np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0)

@@ -54,6 +54,14 @@ def test_a_robot_that_is_faster_than_it_is_told_gets_a_radius_and_then_a_separat
     assert "robot.controller_wheel_radius" not in checked(file, *weak)
 
 
+def test_a_wheel_that_does_not_touch_the_floor_is_why_a_robot_leans(tmp_path, capsys):
+    nose = '<geom name="nose" class="touches" type="sphere" pos="0.05 0 0.02" size="0.01"/>'
+    small = [('type="sphere" size="0.033"', 'type="sphere" size="0.001"')]
+    small.append(('<geom name="scanner"', f'{nose}<geom name="scanner"'))
+    with pytest.raises(UserError, match="wheel 'left_wheel' does not touch the floor: make it"):
+        check_robot.main([str(copy_robot(tmp_path, "turtlebot", small))])
+
+
 def test_what_keeps_a_robot_from_the_farthest_goal_is_told(checked):
     printed = checked("turtlebot")
     assert "goals      reached within 98.5 mm on the floor" in printed
