@@ -57,9 +57,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cli.tell(f"report: {report}")
         cli.open_page(report)
     elif options.compare:
-        cli.tell(
-            changes_table(compare_two(*(cli.find_policy(name, "run") for name in options.compare)))
-        )
+        before, after = (cli.find_policy(name, "run") for name in options.compare)
+        if before.resolve() == after.resolve():
+            parser.error(f"--compare {' '.join(options.compare)}: both are the same run, {before}")
+        cli.tell(changes_table(compare_two(before, after)))
     elif options.delete:
         _delete(options.delete, asks=not options.yes)
     else:

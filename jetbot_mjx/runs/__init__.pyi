@@ -34,9 +34,9 @@ from .nan_dump import replay_nan_dump as replay_nan_dump
 from .nan_dump import save_nan_dump as save_nan_dump
 from .resumption import Resumption as Resumption
 from .resumption import check_resumed as check_resumed
+from .resumption import require_same_run as require_same_run
 from .resumption import resume as resume
 from .resumption import to_trees as to_trees
-from .resumption import trained_steps as trained_steps
 from .run_changes import RunChanges as RunChanges
 from .run_changes import changes_since_the_run_before as changes_since_the_run_before
 from .run_changes import changes_table as changes_table

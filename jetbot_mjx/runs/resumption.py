@@ -79,6 +79,35 @@ def check_resumed(run_dir: Path, stored: Config, config: Config) -> None:
         ) from None
 
 
+def require_same_run(run_dir: Path, stored: Config, config: Config) -> list[int]:
+    """Raise an error if a folder holds a run that a configuration cannot continue.
+
+    A run that ended before its first checkpoint, for example because memory was too small, may
+    start again with another configuration.
+
+    Args:
+      run_dir: the run folder.
+      stored: its configuration.
+      config: the configuration of the training.
+
+    Returns:
+      As `trained_steps`.
+
+    Raises:
+      ConfigError: a setting changed that must not.
+    """
+    trained = trained_steps(run_dir, stored)
+    if stored.seeds != config.seeds or trained:
+        try:
+            stored.check_resume(config)
+        except ConfigError as error:
+            raise ConfigError(
+                f"{run_dir} holds another run: choose a new --run-dir, or begin with its policy,"
+                f" --init-from {run_dir}: {error}"
+            ) from None
+    return trained
+
+
 def trained_steps(run_dir: Path, stored: Config) -> list[int]:
     """Return the last environment step of every seed of a run that has a checkpoint.
 

@@ -206,7 +206,10 @@ def read_info(run_dir: Path) -> RunInfo:
         raise
     except (UserError, OSError) as error:
         raise DamagedRunError(run_dir, str(error)) from None
-    task = f"{clipped(config.task.name, 60)} {config.robot.label} {config.task.observation}"
+    # The list has room for a name only: a run's own page and `config.yaml` have the measures.
+    name, differs, _ = config.robot.label.partition(" with ")
+    robot = f"{name}, changed" if differs else name
+    task = f"{clipped(config.task.name, 60)} {robot} {config.task.observation}"
     own = config.environment
     return RunInfo(
         path=run_dir,

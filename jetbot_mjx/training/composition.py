@@ -126,6 +126,9 @@ def find_code(config: Config, run_dirs: Sequence[Path]) -> tuple[type | None, Ta
             return runs.require_trust(run_dirs[0], config)
         return runs.collect_task_code(config.code)
 
+    if resumes:
+        _explain_distrust(run_dirs[0], config)
+
     sent = distributed.broadcast_from_primary(source) if jax.process_count() > 1 else None
     own_class = runs.trusted_class(run_dirs[0], config) if resumes else None
     if sent and not primary:
@@ -133,6 +136,18 @@ def find_code(config: Config, run_dirs: Sequence[Path]) -> tuple[type | None, Ta
             runs.write_task_code(Path(folder), sent)
             own_class = runs.stored_class(Path(folder), config.code, sent, silent=True)
     return own_class, None if own_class else runs.collect_task_code(config.code)
+
+
+def _explain_distrust(run_dir: Path, config: Config) -> None:
+    """Raise an error for the settings of a run that must not change, if its code may not run."""
+    try:
+        runs.require_trust(run_dir, config)
+    except UserError:
+        # The options of a class are part of what is trusted: others would be untrusted code.
+        stored = runs.stored_config(run_dir)
+        if stored is not None and stored.seeds == config.seeds:
+            runs.require_same_run(run_dir, stored, config)
+        raise
 
 
 def _has_checkpoints(run_dirs: Sequence[Path]) -> bool:

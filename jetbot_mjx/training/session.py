@@ -302,17 +302,7 @@ def _check_folder(training: Training) -> bool:
             f"--run-dir {run_dir} is in use by a run of trainer = {stored.trainer!r}, which cannot"
             " be continued: name a new folder"
         )
-    # A run that ended before its first checkpoint, for example because memory was too small, may
-    # start again with another configuration.
-    trained = runs.trained_steps(run_dir, stored)
-    if stored.seeds != config.seeds or trained:
-        try:
-            stored.check_resume(config)
-        except ConfigError as error:
-            raise ConfigError(
-                f"{run_dir} holds another run: choose a new --run-dir, or begin with its policy,"
-                f" --init-from {run_dir}: {error}"
-            ) from None
+    trained = runs.require_same_run(run_dir, stored, config)
     done = max(trained, default=0)
     planned = config.ppo.all_steps
     if planned < done and config.ppo.num_timesteps != stored.ppo.num_timesteps:

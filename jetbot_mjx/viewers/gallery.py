@@ -328,7 +328,7 @@ def write_video(
             yield frame
             advance(1)
 
-    slowly = " (slow: the processor draws, as no GPU has OpenGL here)" * some_without_gpu()
+    slowly = " (slow: no GPU with OpenGL)" * some_without_gpu()
     with stage(f"frames{slowly}", total) as advance, runs.writing_to(path):
         write_mp4(path, join(watched(*one, advance) for one in zip(videos, shown, strict=True)))
     return list(join(shown[:_GIF_EPISODES], FADE_FRAMES // GIF_STRIDE))

@@ -15,6 +15,7 @@ import contextlib
 import errno
 import http
 import ipaddress
+import logging
 import queue
 import socket
 import time
@@ -169,6 +170,7 @@ class _OriginCheck:
                 return process_request(connection, request) if refusal is None else refusal
 
             self.installed = True
+            options["logger"] = _log_without_unused_connections()
             return serve(*arguments, process_request=check, **options)
 
         with mock.patch.object(websockets.asyncio.server, "serve", serve_with_check):
@@ -212,6 +214,18 @@ class _OriginCheck:
             return name in self._names or bool(ipaddress.ip_address(name))
         except ValueError:
             return False
+
+
+def _log_without_unused_connections() -> logging.Logger:
+    """Return a log for the server that leaves out connections which are closed without a request.
+
+    Browsers open some in advance, and so does whatever looks whether a port is open. The server
+    would show each with a traceback.
+    """
+    log = logging.getLogger(f"{__name__}.websockets")
+    if not log.filters:
+        log.addFilter(lambda record: "opening handshake failed" not in record.getMessage())
+    return log
 
 
 def free_port(host: str, port: int | None) -> int:

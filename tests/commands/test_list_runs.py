@@ -106,6 +106,9 @@ def test_two_runs_are_compared_by_name(runs, capsys):
     assert "10.0%" in out
     assert "20.0%" in out
     assert "all settings are equal" in out
+    with pytest.raises(SystemExit):
+        list_runs.main(["--compare", "latest", "newer"])
+    assert "--compare latest newer: both are the same run, runs/newer" in capsys.readouterr().err
 
 
 def test_a_run_is_deleted_after_a_question(runs, monkeypatch, capsys):

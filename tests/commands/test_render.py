@@ -257,7 +257,7 @@ def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys, s
         ends = {tuple(drive.qpos[min(drive.steps, 20)]) for drive in shown}
         assert len(ends) == 3
     shown = capsys.readouterr().out
-    slowly = "frames (slow: the processor draws, as no GPU has OpenGL here)"
+    slowly = "frames (slow: no GPU with OpenGL)"
     assert stages[-2:] == [(slowly, 2), ("writing the gif", None)]
     assert stages.count(("2 episodes, policy", None)) == 3
     assert "           0 steps  0 of 2 goals reached" in shown

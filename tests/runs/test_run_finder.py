@@ -284,6 +284,12 @@ def test_no_name_can_command_the_terminal(runs, capsys):
 # Configurations.
 
 
+def test_a_robot_of_other_measures_takes_no_more_room(runs):
+    robot = {"preset": "real", "wheel_radius": 0.04, "chassis_mass": 0.9}
+    run = make_run(runs / "runs/own", (0, 60.0, 0.5), robot=robot)
+    assert read_info(run).task == "jetbot_mjx:GoalTask real, changed world"
+
+
 def test_a_run_in_an_environment_shows_its_name_and_return(runs):
     run = make_run(runs / "runs/own", environment="hopper:Hopper")
     lines = [

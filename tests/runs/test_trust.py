@@ -23,7 +23,7 @@ from helpers import fake_hub
 from helpers.damage import damage_about
 from helpers.untrained import write_untrained_run
 from jetbot_mjx import cli
-from jetbot_mjx.config import parse_config
+from jetbot_mjx.config import ConfigError, parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import nan_dump, task_code
 from jetbot_mjx.runs.checkpoint import load_checkpoint
@@ -31,6 +31,7 @@ from jetbot_mjx.runs.nan_dump import load_nan_dump
 from jetbot_mjx.runs.run_dir import write_run
 from jetbot_mjx.runs.task_code import TaskCode, write_task_code
 from jetbot_mjx.runs.trust import check_links, record_code, require_trust, trusted_class, trusting
+from jetbot_mjx.training.composition import find_code
 
 SMALL = {"network": {"policy_hidden_layer_sizes": [4], "value_hidden_layer_sizes": [4]}}
 
@@ -371,6 +372,20 @@ def test_code_that_this_user_has_trained_in_runs(run, home):
     # Once more changes nothing.
     record_code(run, config, None)
     assert [*home.iterdir()] == [record]
+
+
+def test_other_options_of_ones_own_class_are_another_run(run):
+    own(run)
+    config = load_checkpoint(run).config
+    changed = config.model_copy(
+        update={"task": config.task.model_copy(update={"options": {"bonus": 0.7}})}
+    )
+    with pytest.raises(ConfigError, match=r"holds another run: .*task.options.bonus"):
+        find_code(changed, [run])
+    # A stranger's code is refused as such.
+    store(run, {"own.py": b"class Task: pass\n"})
+    with pytest.raises(UserError, match="no training of yours"):
+        find_code(config, [run])
 
 
 def test_other_files_beside_trained_code_are_not_imported(run, canary):

@@ -178,6 +178,17 @@ def test_starting_and_stopping_say_nothing(player, capfd, unused_port):
     assert capfd.readouterr() == ("", "")
 
 
+def test_a_connection_that_is_not_used_says_nothing(player, caplog, unused_port):
+    port = unused_port()
+    with ViserViewer(player, host="127.0.0.1", port=port, tell=print):
+        for _ in range(2):
+            socket.create_connection(("127.0.0.1", port)).close()
+        # The page still answers, and what was logged before it was is here.
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as page:
+            assert page.status == 200
+    assert [record.getMessage() for record in caplog.records] == []
+
+
 def test_a_busy_port_is_refused_where_it_was_asked_for():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
