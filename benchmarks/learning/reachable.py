@@ -247,8 +247,9 @@ class _Spun:
 
     def __init__(self, lattice: _Lattice, limits: Limits, grid: Grid) -> None:
         angle = 2 * np.pi / grid.headings
-        headings = np.arange(grid.headings) * angle
         self._limits, v, w = limits, lattice.v[lattice.free, None], lattice.w[lattice.free, None]
+        # It moves along its heading after the turn of this control step, as in `_gain`.
+        headings = np.arange(grid.headings) * angle + w * limits.ctrl_dt * limits.lateness
         # Between the states of the lattice, velocities are larger by this at most.
         apart = lattice.width * (1 + limits.slip * limits.max_yaw_rate)
         apart += limits.max_speed * (angle / 2 + limits.slip * lattice.width / lattice.track)
