@@ -123,14 +123,14 @@ def find_code(config: Config, run_dirs: Sequence[Path]) -> tuple[type | None, Ta
 
     def source() -> TaskCode | None:
         if resumes:
-            return runs.require_trust(run_dirs[0], config)
+            return _require_trust(run_dirs[0], config)
         return runs.collect_task_code(config.code)
 
-    if resumes:
-        _explain_distrust(run_dirs[0], config)
-
     sent = distributed.broadcast_from_primary(source) if jax.process_count() > 1 else None
-    own_class = runs.trusted_class(run_dirs[0], config) if resumes else None
+    own_class = None
+    if resumes:
+        _require_trust(run_dirs[0], config)
+        own_class = runs.trusted_class(run_dirs[0], config)
     if sent and not primary:
         with tempfile.TemporaryDirectory() as folder:
             runs.write_task_code(Path(folder), sent)
@@ -138,10 +138,10 @@ def find_code(config: Config, run_dirs: Sequence[Path]) -> tuple[type | None, Ta
     return own_class, None if own_class else runs.collect_task_code(config.code)
 
 
-def _explain_distrust(run_dir: Path, config: Config) -> None:
-    """Raise an error for the settings of a run that must not change, if its code may not run."""
+def _require_trust(run_dir: Path, config: Config) -> TaskCode | None:
+    """Return what `runs.require_trust` does; where settings changed that must not, say that."""
     try:
-        runs.require_trust(run_dir, config)
+        return runs.require_trust(run_dir, config)
     except UserError:
         # The options of a class are part of what is trusted: others would be untrusted code.
         stored = runs.stored_config(run_dir)
