@@ -3,7 +3,8 @@
 It runs where jetbot_mjx is installed. The robot is a `SimulatedJetBot`, with delay, dead-band and
 lag between motor value and wheel. A simulated tracker sends its pose `--rate` times a second, with
 noise of `--noise` metres. Goals are drawn as in the tutorial, and each drive starts at the origin.
-With `--camera` a policy drives by pictures: see rehearse_camera.py.
+With `--camera` a policy drives by pictures; `docs/deploy.md` says how. While it computes, the
+progress is shown on stderr.
 """
 
 import argparse
@@ -17,11 +18,12 @@ import numpy as np
 from drive import Outcome, Policy, Settings, arrival_radius, at_least, drive, load_policy
 from motors import Calibration, DriveError, check_calibration, default_calibration
 from poses import Tracker
-from rehearse_camera import CameraRehearsal, passed, summary
+from rehearse_camera import CameraRehearsal, counted, passed, summary
 
 from jetbot_mjx.deployment.simulated_camera import CameraModel
 from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, SimulatedJetBot
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.terminal import show_progress
 
 _RATE = 60.0
 """Poses per second."""
@@ -98,7 +100,7 @@ def rehearse(
     within = arrival_radius(policy.spec)
     rng = np.random.default_rng(0)
     outcomes = []
-    for goal in goals:
+    for goal in counted("goals", goals):
         robot.place(Pose(0.0, 0.0, 0.0))
         poses = Tracker(Camera(robot, rate, noise, rng).receive)
         settings = Settings(goal, timeout, 0.08, within)
@@ -204,10 +206,11 @@ def _by_camera(policy: Policy, motors: MotorModel, options: argparse.Namespace) 
     rehearsal = CameraRehearsal(policy, calibration, motors, camera, options.appearance)
     outcomes = [
         rehearsal.drive(goal, options.timeout, number)
-        for number, goal in enumerate(draw_goals(options.goals))
+        for number, goal in enumerate(counted("goals", draw_goals(options.goals)))
     ]
     faults = rehearsal.faults(options.faults)
-    searches = [rehearsal.search(options.timeout, seed) for seed in range(options.searches)]
+    seeds = counted("drives that begin without a cube", range(options.searches))
+    searches = [rehearsal.search(options.timeout, seed) for seed in seeds]
     print(summary(outcomes, faults, searches))
     return int(not passed(outcomes, faults, searches, options.min_success))
 
@@ -224,6 +227,11 @@ def main(arguments: list[str] | None = None) -> int:
       fewer of the searches succeeded.
     """
     options = _parser().parse_args(arguments)
+    with show_progress(sys.stderr):
+        return _run(options)
+
+
+def _run(options: argparse.Namespace) -> int:
     try:
         for name, least in (("goals", 1), ("faults", 0), ("searches", 0)):
             if getattr(options, name) < least:

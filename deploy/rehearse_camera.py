@@ -7,7 +7,8 @@ robot, with its watchdog.
 
 import math
 import statistics
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from camera_sense import CameraSense, CameraSettings
@@ -22,6 +23,9 @@ from jetbot_mjx.deployment.simulated_camera import (
 )
 from jetbot_mjx.deployment.simulated_jetbot import MotorModel, Pose, SimulatedJetBot
 from jetbot_mjx.envs.camera.scenery import SceneryKind
+from jetbot_mjx.terminal import stage
+
+T = TypeVar("T")
 
 FAULTS: tuple[Fault, ...] = ("frozen", "black")
 
@@ -136,7 +140,7 @@ class CameraRehearsal:
         rng = np.random.default_rng(seed)
         return [
             self._fault(FAULTS[index % len(FAULTS)], *rng.uniform((-0.7, 0.4), (0.7, 1.2)))
-            for index in range(count)
+            for index in counted("drives with a broken camera", range(count))
         ]
 
     def _fault(self, kind: Fault, bearing: float, at: float) -> FaultCase:
@@ -181,6 +185,14 @@ class CameraRehearsal:
         x, y, yaw = np.array(path).T
         turned = abs(float(np.unwrap(yaw)[-1] - yaw[0]))
         return Search(turned, float(np.hypot(x, y).max()), outcome.reached)
+
+
+def counted(name: str, things: Sequence[T]) -> Iterator[T]:
+    """Yield things, and report as a stage how many of them are done."""
+    with stage(name, len(things)) as advance:
+        for thing in things:
+            yield thing
+            advance(1)
 
 
 def passed(

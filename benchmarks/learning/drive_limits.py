@@ -2,7 +2,7 @@
 
 Inertia comes from the model's mass matrix. How fast wheels speed up and brake, and how far the
 motion of a real contact differs from that of rolling wheels, is measured in many drives by
-commands that switch, wander and ramp, with a margin.
+commands that switch, wander, ramp and alternate, with a margin.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,9 @@ MARGIN = 1.005
 
 _MARGIN_OF_SPEED = 1.003  # the same for speeds, which the motors' controller holds closely
 
-_MARGIN_OF_ERROR = 1.2
+_MARGIN_OF_SPUN = 1.2  # the same for what is rare: backwards, or after a robot has spun
+
+_MARGIN_OF_ERROR = 2.5  # a search for commands finds some that are twice as far apart
 
 # Chosen; `Limits.error` is measured with them.
 GROWTH = 0.45  # [rad/s²] by which |ω| may grow faster than by the drift
@@ -30,6 +32,8 @@ _TURN = 1.4  # largest v |ω| with limits, as a multiple of that of the commande
 _DRIVEN = 0.1  # of the largest change of the yaw rate: more is that of motors
 _SHARE = 0.977  # of the largest measured change of speed, which lasts for single steps only
 _OUTER_LOSS, _INNER_LOSS = 1.0, 0.6  # of `Limits.slip`
+
+_BEND = 0.2  # [rad] by which a drive that follows another heads for its place at most
 
 
 class Motion(NamedTuple):
@@ -48,7 +52,7 @@ class Motion(NamedTuple):
 
 
 def random_actions(seed: int, count: int, steps: int, size: int = 2) -> np.ndarray:
-    """Return actions that switch between the ends, wander, turn then drive, or ramp.
+    """Return actions that switch, wander, turn then drive, ramp, or alternate.
 
     Args:
       seed: the seed.
@@ -61,19 +65,29 @@ def random_actions(seed: int, count: int, steps: int, size: int = 2) -> np.ndarr
     for i in range(count):
         hold = int(rng.integers(1, 40))
         held = rng.uniform(-1, 1, (steps // hold + 1, size))
-        if i % 4 == 0:
+        if i % 6 == 0:
             actions[i] = np.repeat(np.sign(held), hold, axis=0)[:steps]
-        elif i % 4 == 1:
+        elif i % 6 == 1:
             actions[i] = np.repeat(held, hold, axis=0)[:steps]
-        elif i % 4 == 2:
+        elif i % 6 == 2:
             begins, ends = rng.integers(0, steps // 2, (2, size))
             first, then = rng.choice([-1.0, 0.0, 1.0], (2, size))
             actions[i] = np.where(time[:, None] < begins, first, then)
             actions[i, : ends[0], 1] = rng.choice([-1.0, 1.0])
-        else:
+        elif i % 6 == 3:
             corners = rng.choice([-1.0, -0.5, 0.0, 0.5, 1.0], (8, size))
             places = np.linspace(0, 7, steps)
             actions[i] = np.stack([np.interp(places, range(8), x) for x in corners.T], axis=-1)
+        elif i % 6 == 4:
+            # Many at the ends, each held as long as it happens.
+            pieces = int(rng.integers(4, 13))
+            place = np.searchsorted(np.sort(rng.uniform(0, steps, pieces - 1)), time)
+            actions[i] = np.clip(1.5 * rng.standard_normal((pieces, size)), -1, 1)[place]
+        else:
+            # All but one action stay; that one alternates, from some time on.
+            actions[i] = rng.choice([-1.0, 1.0], size)
+            turns = time // int(rng.integers(1, 12)) % 2 * 2 - 1
+            actions[i, :, -1] = np.where(time < rng.integers(0, steps), 1.0, turns)
     return actions
 
 
@@ -156,30 +170,117 @@ def sides(constants: Inertia, moved: Motion, ctrl_dt: float) -> Float[np.ndarray
     return np.stack([grown + turned - swing + drag, grown - turned + swing + drag])
 
 
-def follow(moved: Motion, limits: Limits) -> Motion:
+def nearest(moved: Motion, limits: Limits) -> Motion:
+    """Return drives that keep to limits of torque and motors, each the closest of some to another.
+
+    Any drive that keeps to the limits will do, so each is followed with several `Gains`.
+    """
+    best, least = moved, np.full(len(moved.speed), np.inf)
+    for gains in _GAINS:
+        near = follow(moved, limits, gains)
+        most = errors(moved, near, limits).max(axis=1)
+        closer = most < least
+        speed = np.where(closer[:, None], near.speed, best.speed)
+        yaw_rate = np.where(closer[:, None], near.yaw_rate, best.yaw_rate)
+        best, least = moved._replace(speed=speed, yaw_rate=yaw_rate), np.minimum(most, least)
+    return best
+
+
+def errors(moved: Motion, near: Motion, limits: Limits) -> Float[np.ndarray, "n t"]:
+    """Return how far drives are from those that follow them, as `Limits.error` counts it [m/s].
+
+    It is zero after the step in which the following robot begins to spin.
+    """
+    apart = np.linalg.norm(path(near, limits) - moved.position[..., :2], axis=-1)
+    time = np.arange(apart.shape[1]) * limits.ctrl_dt + ERROR_TIME
+    counts = np.ones(apart.shape, bool)
+    counts[:, 1:] = within(near, limits.max_yaw_rate, limits.max_turn)[:, :-1]
+    return np.where(counts, apart / time, 0)
+
+
+class Gains(NamedTuple):
+    """A `Gains` says how strongly a drive that follows another corrects what it is off."""
+
+    heading: float
+    """[1/s] of the heading."""
+    across: float
+    """[rad/m] of the place across, by the heading."""
+    along: float
+    """[1/s] of the place along."""
+
+
+_GAINS = [
+    Gains(heading, across, along)
+    for heading in (0.0, 3.0, 6.0, 10.0, 16.0, 25.0)
+    for across, along in ((0.0, 0.0), (3.0, 2.0), (6.0, 5.0))
+]
+
+
+def follow(moved: Motion, limits: Limits, gains: Gains) -> Motion:
     """Return drives that keep to limits of torque and motors, and follow others closely."""
+    late, both = limits.lateness, np.zeros((2, *moved.speed.shape))
+    headings = np.unwrap(moved.heading, axis=1) - moved.heading[:, :1]
+    speed, yaw_rate = moved.speed[:, 0], moved.yaw_rate[:, 0]
+    place, heading = np.zeros((len(speed), 2)), np.zeros_like(speed)
+
+    def move(to_speed: np.ndarray, to_rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the place and the heading after a step that ends with these rates."""
+        begin = _velocity(speed, yaw_rate, heading, limits)
+        turned = heading + limits.ctrl_dt * ((1 - late) * yaw_rate + late * to_rate)
+        end = _velocity(to_speed, to_rate, turned, limits)
+        return place + limits.ctrl_dt * ((1 - late) * begin + late * end), turned
+
+    for t in range(1, moved.speed.shape[1]):
+        now = headings[:, t]
+        aim_speed, aim_rate = moved.speed[:, t], moved.yaw_rate[:, t]
+        # How far would it be off with the same rates?
+        after, turned = move(aim_speed, aim_rate)
+        apart = moved.position[:, t, :2] - after
+        off = _on_floor(apart[:, 0], apart[:, 1], -now)
+        bend = np.clip(gains.across * off[:, 1] * np.sign(aim_speed), -_BEND, _BEND)
+        rate = aim_rate + gains.heading * (now - turned + bend)
+        fastest = np.maximum(np.abs(aim_rate), limits.motor_yaw_rate)
+        rate = np.clip(rate, -fastest, fastest)
+        # The speed is none that the robot could not have.
+        wheel = limits.half_track * np.abs(aim_rate) + aim_speed
+        room = np.maximum(wheel, limits.max_wheel_speed) - limits.half_track * np.abs(rate)
+        most = np.maximum(aim_speed, np.minimum(limits.max_speed, room))
+        ahead = np.clip(aim_speed + gains.along * off[:, 0], np.minimum(aim_speed, 0), most)
+        ends = _torque(speed, yaw_rate, ahead, rate, limits)
+        place, heading = move(*ends)
+        speed, yaw_rate = both[:, :, t] = ends
+    return moved._replace(speed=both[0], yaw_rate=both[1])
+
+
+def _velocity(
+    speed: np.ndarray, yaw_rate: np.ndarray, heading: np.ndarray, limits: Limits
+) -> np.ndarray:
+    """Return the velocity on the floor of a robot that slips in turns [m/s]."""
+    return _on_floor(speed, -limits.slip * speed * yaw_rate, heading)
+
+
+def _torque(
+    v: np.ndarray, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray, limits: Limits
+) -> np.ndarray:
+    """Return speeds and yaw rates after a control step towards others, within the limits."""
     dt, track, most = limits.ctrl_dt, limits.track, limits.step
-    right, left = moved.speed + track * moved.yaw_rate, moved.speed - track * moved.yaw_rate
-    speed, yaw_rate = np.zeros_like(right), np.zeros_like(right)
-    p, q = right[:, 0], left[:, 0]
-    for t in range(1, right.shape[1]):
-        # The drift.
-        v, w = (p + q) / 2, (p - q) / 2 / track
-        sign, lost = np.sign(w), np.maximum(v, 0) * w**2
-        swing = limits.swing * v * w * track
-        outer, inner = limits.outer_loss * lost, limits.inner_loss * lost
-        grows = 2 * track * limits.growth * (np.abs(w) > limits.motor_yaw_rate)
-        slowed = limits.drag * w**2
-        p = p + dt * (swing - slowed - np.where(sign > 0, outer, inner) + grows * (sign > 0))
-        q = q + dt * (-swing - slowed - np.where(sign < 0, outer, inner) + grows * (sign < 0))
-        # The torque that comes closest; it does not raise |ω| beyond the motors' yaw rate.
-        a = np.clip(right[:, t] - p, -limits.brake * most, most)
-        b = np.clip(left[:, t] - q, -limits.brake * most, most)
-        room = np.maximum(2 * track * limits.motor_yaw_rate - np.abs(p - q), 0)
-        beyond = np.sign(p - q) * np.maximum(np.sign(p - q) * (a - b) - room, 0) / 2
-        p, q = p + a - beyond, q + b + beyond
-        speed[:, t], yaw_rate[:, t] = (p + q) / 2, (p - q) / 2 / track
-    return moved._replace(speed=speed, yaw_rate=yaw_rate)
+    # The drift.
+    sign, lost = np.sign(w), np.maximum(v, 0) * w**2
+    swing = limits.swing * v * w * track
+    outer, inner = limits.outer_loss * lost, limits.inner_loss * lost
+    grows = 2 * track * limits.growth * (np.abs(w) > limits.motor_yaw_rate)
+    slowed = limits.drag * w**2
+    p = v + track * w
+    p = p + dt * (swing - slowed - np.where(sign > 0, outer, inner) + grows * (sign > 0))
+    q = v - track * w
+    q = q + dt * (-swing - slowed - np.where(sign < 0, outer, inner) + grows * (sign < 0))
+    # The torque that comes closest; it does not raise |ω| beyond the motors' yaw rate.
+    a = np.clip(ahead + track * rate - p, -limits.brake * most, most)
+    b = np.clip(ahead - track * rate - q, -limits.brake * most, most)
+    room = np.maximum(2 * track * limits.motor_yaw_rate - np.abs(p - q), 0)
+    beyond = np.sign(p - q) * np.maximum(np.sign(p - q) * (a - b) - room, 0) / 2
+    p, q = p + a - beyond, q + b + beyond
+    return np.stack([(p + q) / 2, (p - q) / 2 / track])
 
 
 def path(moved: Motion, limits: Limits) -> Float[np.ndarray, "n t 2"]:
@@ -193,7 +294,7 @@ def velocities(moved: Motion, limits: Limits) -> Float[np.ndarray, "n t 2"]:
     """Return the velocities on the floor that follow from speeds and yaw rates alone [m/s]."""
     turns = _steps(moved.yaw_rate, limits)
     heading = np.concatenate([np.zeros_like(turns[:, :1]), np.cumsum(turns, axis=1)], axis=1)
-    return _on_floor(moved.speed, -limits.slip * moved.speed * moved.yaw_rate, heading)
+    return _velocity(moved.speed, moved.yaw_rate, heading, limits)
 
 
 def _steps(rate: np.ndarray, limits: Limits) -> np.ndarray:
@@ -245,28 +346,28 @@ def measure(env: JetBotEnv, whole: Motion) -> Limits | str:
     driven = (w[:, 1:] > drifted + _DRIVEN * most_grown / constants.track) & calm[:, 1:]
     motors = MARGIN * float(w[:, 1:][driven].max())
     if not spins:
-        motors = most = max(motors, MARGIN * float(w.max()))
-    step = MARGIN * max(_SHARE * most_grown, _growth_after(whole, ~calm))
+        motors, most = max(motors, MARGIN * float(w.max())), np.inf
     curve = v * w
     slip = -float((whole.sideways * v * whole.yaw_rate)[calm].sum() / (curve[calm] ** 2).sum())
     limits = Limits(
         ctrl_dt=dt,
         track=constants.track,
-        step=step,
+        step=MARGIN * _SHARE * most_grown,
         brake=1.0,
         swing=constants.swing,
         drag=constants.drag,
         outer_loss=_OUTER_LOSS * slip,
         inner_loss=_INNER_LOSS * slip,
-        max_speed=0.0,
+        max_speed=float(v.max()),
         min_speed=0.0,
         motor_yaw_rate=motors,
         growth=GROWTH if spins else 0.0,
         max_yaw_rate=most,
         max_turn=turn,
         grip=0.0,
+        spun_step=0.0,
         half_track=constants.half_track,
-        max_wheel_speed=0.0,
+        max_wheel_speed=float((v + constants.half_track * w)[calm].max()),
         lateness=lateness(env),
         slip=slip,
         error=0.0,
@@ -276,19 +377,23 @@ def measure(env: JetBotEnv, whole: Motion) -> Limits | str:
 
 def _with_the_rest(whole: Motion, limits: Limits) -> Limits:
     """Return limits with those of speeds, the grip and the error, of drives that keep to them."""
-    # A drive within the limits follows each of the measured ones: how far are they apart?
-    near = follow(whole, limits)
+    near = nearest(whole, limits)
     calm = within(near, limits.max_yaw_rate, limits.max_turn)
-    apart = np.linalg.norm(path(near, limits) - whole.position[..., :2], axis=-1) * calm
-    time = np.arange(apart.shape[1]) * limits.ctrl_dt
+    on_floor = np.where(calm, near.speed, np.hypot(whole.speed, whole.sideways))
+    fastest = _MARGIN_OF_SPEED * max(float(whole.speed.max()), float(on_floor.max()))
+    slowest = _MARGIN_OF_SPUN * min(float(near.speed[calm].min()), 0.0)
     wheel = near.speed + limits.half_track * np.abs(near.yaw_rate)
-    highest_speed = max(float(whole.speed.max()), float(near.speed[calm].max()))
+    grip, growth = once_spun(whole, near, limits)
+    if np.isinf(limits.max_yaw_rate):
+        widest = max(limits.motor_yaw_rate, float(np.abs(near.yaw_rate).max()))
+        limits = limits._replace(motor_yaw_rate=widest, max_yaw_rate=widest)
     return limits._replace(
-        max_speed=_MARGIN_OF_SPEED * highest_speed,
-        min_speed=MARGIN * min(float(near.speed[calm].min()), 0.0),
+        max_speed=fastest,
+        min_speed=slowest,
         max_wheel_speed=_MARGIN_OF_SPEED * float(wheel[calm].max()),
-        grip=_MARGIN_OF_ERROR * _grip(whole, near, limits, calm),
-        error=_MARGIN_OF_ERROR * float((apart / (time + ERROR_TIME)).max()),
+        grip=_MARGIN_OF_SPUN * float(grip.max()),
+        spun_step=_MARGIN_OF_SPUN * float(growth.max()),
+        error=_MARGIN_OF_ERROR * float(errors(whole, near, limits).max()),
     )
 
 
@@ -298,26 +403,28 @@ def within(moved: Motion, max_yaw_rate: float, max_turn: float) -> Bool[np.ndarr
     return np.logical_and.accumulate((w <= max_yaw_rate) & (moved.speed * w <= max_turn), axis=1)
 
 
-def _grip(whole: Motion, near: Motion, limits: Limits, calm: Bool[np.ndarray, "n t"]) -> float:
-    """Return the acceleration on the floor, averaged since the robot spins [m/s²]."""
-    velocity, first = (
-        _on_floor(whole.speed, whole.sideways, whole.heading),
-        velocities(near, limits),
-    )
-    most = 0.0
-    for now, begin, here in zip(velocity, first, calm, strict=True):
-        start, time = int(here.sum()), limits.ctrl_dt * np.arange(1, here.size)
-        if start + 1 < here.size:
-            change = np.linalg.norm(now[start + 1 :] - begin[start], axis=-1)
-            most = max(most, float((change / time[: change.size]).max()))
-    return most
+def once_spun(
+    whole: Motion, near: Motion, limits: Limits
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return by how much velocity and speed change on the floor, on average since a robot spins.
 
+    Args:
+      whole: drives.
+      near: the drives that follow them, which tell when the robots begin to spin.
+      limits: the limits; only those of the path and of the yaw rate are used.
 
-def _growth_after(moved: Motion, spun: Bool[np.ndarray, "n t"]) -> float:
-    """Return by how much the speed on the floor grows in a step on average, once it spins."""
-    speed, most = np.hypot(moved.speed, moved.sideways), 0.0
-    for one, here in zip(speed, spun, strict=True):
-        rest = one[here]
-        steps = np.arange(1, rest.size)
-        most = max(most, float(((rest[1:] - rest[0]) / steps).max())) if rest.size > 1 else most
-    return most
+    Returns:
+      The largest change of the velocity [m/s²], and of the speed in a control step [m/s].
+    """
+    velocity = _on_floor(whole.speed, whole.sideways, whole.heading)
+    calm = within(near, limits.max_yaw_rate, limits.max_turn)
+    grip, growth = np.zeros((2, len(velocity)))
+    for i, (now, begin) in enumerate(zip(velocity, velocities(near, limits), strict=True)):
+        start = int(calm[i].sum())
+        steps = np.arange(1, len(now) - start)
+        if steps.size:
+            first, rest = begin[start], now[start + 1 :]
+            grip[i] = (np.linalg.norm(rest - first, axis=-1) / steps).max() / limits.ctrl_dt
+            faster = np.linalg.norm(rest, axis=-1) - np.linalg.norm(first)
+            growth[i] = (faster / steps).max()
+    return grip, growth

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-ERROR_TIME = 0.25
+ERROR_TIME = 1.0
 """[s] Time before the start from which `Limits.error` counts."""
 
 _NEVER = np.float32(-1e6)  # [m] value of a state that is outside of the limits
@@ -59,6 +59,8 @@ class Limits(NamedTuple):
     """[m/s²] v |ω| beyond which only velocities are limited; infinite if it is never reached."""
     grip: float
     """[m/s²] by which the velocity on the floor may change, from then on."""
+    spun_step: float
+    """[m/s] by which the speed on the floor may grow in a control step, from then on."""
     half_track: float
     """[m] half of the distance of the wheels."""
     max_wheel_speed: float
@@ -260,7 +262,7 @@ class _Spun:
     def _speed(self, step: int) -> np.ndarray:
         """Return the largest speed in the direction after some steps, of each state [m/s]."""
         gained = step * self._limits.grip * self._limits.ctrl_dt
-        speed = np.minimum(self._along + gained, self._fast + step * self._limits.step)
+        speed = np.minimum(self._along + gained, self._fast + step * self._limits.spun_step)
         return np.minimum(speed, self._limits.max_speed)
 
     def __call__(self, step: int) -> np.ndarray:

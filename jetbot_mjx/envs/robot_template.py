@@ -12,7 +12,8 @@ _MODEL = "turtlebot"
 
 _SETTINGS = """\
 # A robot with two driven wheels and casters, on the goal task. The measures are those of a JetBot:
-# write yours in their place. The configuration reference has each with its unit and bounds.
+# write yours in their place. The configuration reference, which `make docs` writes, has each with
+# its unit and bounds.
 robot:
   preset: real
 {measures}

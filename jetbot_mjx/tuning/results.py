@@ -155,7 +155,7 @@ def write_results(
     """
     study = search.study
     path = folder / "best.yaml"
-    tables = [*([entrants_table(entrants)] if entrants else []), _trials_table(study)]
+    tables = [*([entrants_table(entrants)] if entrants else []), _trials_table(search)]
     with writing_to(folder):
         write_model(folder, config)
         write_text(
@@ -204,7 +204,8 @@ def _mean_seconds(seconds: Sequence[float | None]) -> str:
     return f"{statistics.fmean(known):.3f}" if known else "-"
 
 
-def _trials_table(study: optuna.Study) -> str:
+def _trials_table(search: Search) -> str:
+    study = search.study
     kind, objective = study_score(study), study_objective(study)
     unit = " [%]" if kind == "success" else ""
     names = sorted({name for trial in study.trials for name in trial.params})
@@ -216,7 +217,8 @@ def _trials_table(study: optuna.Study) -> str:
     for trial in ranked_trials(study):
         values = " | ".join(_short(trial.params.get(name, "-")) for name in names)
         lines.append(
-            f"| {trial.number} | {format_objective(trial.value or 0.0, objective, kind)}"
+            f"| {trial.number}{' (as given)' if search.is_given(trial) else ''}"
+            f" | {format_objective(trial.value or 0.0, objective, kind)}"
             f" | {_number(trial.user_attrs[SCORES[kind]], kind)}"
             f" | {_mean_seconds([trial.user_attrs['mean_seconds']])} | {values} |"
         )

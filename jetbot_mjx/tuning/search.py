@@ -360,6 +360,10 @@ class Search:
             )
         return entrants
 
+    def is_given(self, trial: FrozenTrial) -> bool:
+        """Return whether a trial has the values of the given configuration."""
+        return self.values_of(trial) == self._given
+
     def values_of(self, trial: FrozenTrial) -> dict[str, Value]:
         """Return the values of a trial that is stored."""
         return {one.name: one.from_optuna(trial.params[one.name]) for one in self._space}

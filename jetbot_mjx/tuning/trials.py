@@ -146,7 +146,10 @@ class Trials:
         state = self._prepare(traced, keys, goals)
         # The trials that still train, by their row of the state.
         rows, outcomes = dict(enumerate(range(count))), [Outcome((), None, None)] * count
-        with stage(f"intervals of training {count} policies", len(self._steps)) as advance:
+        with stage(
+            f"training {count} {'policy' if count == 1 else 'policies'}, intervals",
+            len(self._steps),
+        ) as advance:
             for left, steps in zip(reversed(range(len(self._steps))), self._steps, strict=True):
                 state = self._advance(traced, state, np.int32(steps))
                 episodes = self.evaluate(state.policy_params, goals)
@@ -199,7 +202,9 @@ class Trials:
     ) -> TrainState:
         """Return the stacked states before the first step, with compiled programs for them."""
         width = len(seeds)
-        with stage(f"compiling the training of {width} {'policy' if width == 1 else 'policies'}"):
+        # Numbers of policies share programs: 3 train as 4 of which one is not looked at.
+        many = "one policy" if width == 1 else f"up to {width} policies"
+        with stage(f"compiling the training of {many}"):
             state = self._begin(traced, seeds)
             if width not in self._compiled:
                 state = self._advance(traced, state, np.int32(0))

@@ -1,5 +1,6 @@
 """Driving by camera: images are resized, checked and logged, with a SimulatedCamera."""
 
+import contextlib
 import json
 import math
 import sys
@@ -473,6 +474,21 @@ def test_poses_have_no_place_beside_a_camera(folder, name, capsys):
     assert rehearse.main([str(folder), "--camera", f"--{name}", "30"]) == 2
     said = f"error: --{name} concerns poses, and --camera uses none: leave it out\n"
     assert capsys.readouterr().err == said
+
+
+def test_what_takes_long_says_how_far_it_is(monkeypatch):
+    done = []
+
+    @contextlib.contextmanager
+    def stage(name, total):
+        done.append((name, total))
+        yield done.append
+
+    monkeypatch.setattr(rehearse_camera, "stage", stage)
+    assert list(rehearse_camera.counted("goals", ["a", "b"])) == ["a", "b"]
+    rehearsal().faults(0)
+    rehearse.rehearse(make_policy(servo), [], motors=MotorModel())
+    assert done == [("goals", 2), 1, 1, ("drives with a broken camera", 0), ("goals", 0)]
 
 
 @pytest.mark.slow

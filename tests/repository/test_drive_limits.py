@@ -9,13 +9,17 @@ import pytest
 
 from benchmarks.learning.drive_limits import (
     MARGIN,
+    Gains,
     Inertia,
     Motion,
     drive,
+    errors,
     follow,
     inertia,
     measure,
     motion,
+    nearest,
+    once_spun,
     path,
     random_actions,
     sides,
@@ -25,28 +29,10 @@ from benchmarks.learning.reachable import ERROR_TIME, Grid, Limits, farthest, le
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs import make_jetbot_env
 from jetbot_mjx.evaluation.best_known import BOUND_FILE
+from tests.helpers.limits import PLAIN
 
-LIMITS = Limits(
-    ctrl_dt=0.01,
-    track=0.05,
-    step=0.03,
-    brake=1.0,
-    swing=0.0,
-    drag=0.0,
-    outer_loss=0.0,
-    inner_loss=0.0,
-    max_speed=1.0,
-    min_speed=0.0,
-    motor_yaw_rate=3.0,
-    growth=0.0,
-    max_yaw_rate=3.0,
-    max_turn=np.inf,
-    grip=0.0,
-    half_track=0.06,
-    max_wheel_speed=9.0,
-    lateness=0.5,
-    slip=0.02,
-    error=0.0,
+LIMITS = PLAIN._replace(
+    ctrl_dt=0.01, step=0.03, max_speed=1.0, max_wheel_speed=9.0, lateness=0.5, slip=0.02
 )
 
 CONFIGS = {"isaac": "jetbot", "real": "real_jetbot"}
@@ -56,7 +42,10 @@ def test_actions_are_actions_of_all_kinds():
     actions = random_actions(3, 64, 50)
     assert actions.shape == (64, 50, 2)
     assert np.abs(actions).max() <= 1
-    assert (np.abs(actions[::4]) == 1).all()
+    assert (np.abs(actions[::6]) == 1).all()
+    # The last kind alternates one action alone.
+    assert (np.diff(actions[5::6, :, 0], axis=1) == 0).all()
+    assert (np.abs(np.diff(actions[5::6, :, 1], axis=1)).max(axis=1) == 2).any()
     np.testing.assert_array_equal(actions, random_actions(3, 64, 50))
 
 
@@ -125,20 +114,35 @@ def test_a_path_follows_from_speeds_and_yaw_rates():
     np.testing.assert_allclose(path(moved, LIMITS)[0], np.stack([x, y], axis=1), atol=1e-4)
 
 
-def test_a_drive_within_the_limits_follows_any_other():
-    zeros, rng = np.zeros((64, 60)), np.random.default_rng(2)
+def _rolling(speed, yaw_rate, limits):
+    """Return drives whose places follow from their rates."""
+    zeros, late = np.zeros_like(speed), limits.lateness
+    turns = limits.ctrl_dt * ((1 - late) * yaw_rate[:, :-1] + late * yaw_rate[:, 1:])
+    heading = np.concatenate([zeros[:, :1], np.cumsum(turns, axis=1)], axis=1)
+    moved = Motion(np.zeros((*speed.shape, 3)), speed, zeros, yaw_rate, heading)
+    moved.position[..., :2] = path(moved, limits)
+    return moved
+
+
+def _wild():
+    rng = np.random.default_rng(2)
     speed, yaw_rate = rng.uniform(0, 1, (2, 64, 60)) * [[[1.0]], [[4.0]]]
     speed[:, 0] = yaw_rate[:, 0] = 0
     limits = LIMITS._replace(swing=4.0, drag=0.013, outer_loss=0.02, inner_loss=0.01)
-    wild = Motion(np.zeros((64, 60, 3)), speed, zeros, yaw_rate, zeros)
-    near = follow(wild, limits)
+    return _rolling(speed, yaw_rate, limits), limits
+
+
+@pytest.mark.parametrize("gains", [Gains(0.0, 0.0, 0.0), Gains(10.0, 3.0, 2.0)])
+def test_a_drive_within_the_limits_follows_any_other(gains):
+    wild, limits = _wild()
+    near = follow(wild, limits, gains)
     # Both sides keep to the step, besides the drift and what the turn takes.
     constants = Inertia(limits.track, limits.swing, limits.drag, limits.half_track)
     lost = limits.ctrl_dt * (near.speed * near.yaw_rate**2)[:, :-1]
     outer, inner = sides(constants, near, limits.ctrl_dt)
     assert np.abs(outer + limits.outer_loss * lost).max() <= limits.step + 1e-9
     assert np.abs(inner + limits.inner_loss * lost).max() <= limits.step + 1e-9
-    assert np.abs(near.speed - speed).max() > 0.1
+    assert np.abs(near.speed - wild.speed).max() > 0.1
     # Torque does not raise the yaw rate beyond that of the motors.
     fast = near.yaw_rate[:, 1:] > limits.motor_yaw_rate
     drift = 1 + limits.swing * np.maximum(near.speed, 0)[:, :-1] * limits.ctrl_dt
@@ -146,9 +150,59 @@ def test_a_drive_within_the_limits_follows_any_other():
         fast
     ].all()
     # What keeps to them is followed exactly.
-    again = follow(near, limits)
+    near = _rolling(near.speed, near.yaw_rate, limits)
+    again = follow(near, limits, gains)
     np.testing.assert_allclose(again.speed, near.speed, atol=1e-9)
     np.testing.assert_allclose(again.yaw_rate, near.yaw_rate, atol=1e-9)
+
+
+def test_a_following_drive_returns_to_where_the_other_is():
+    # A drive that is pushed aside where it could not follow; then it drives on evenly.
+    limits = LIMITS._replace(max_wheel_speed=2.0)
+    moved = _rolling(np.full((1, 150), 0.5), np.full((1, 150), 0.5), limits)
+    moved.position[:, 20:, 1] += 0.02
+    moved.speed[:, 0] = moved.yaw_rate[:, 0] = 0.0
+    apart = [
+        np.linalg.norm(
+            path(follow(moved, limits, gains), limits)[0, -1] - moved.position[0, -1, :2]
+        )
+        for gains in (Gains(0.0, 0.0, 0.0), Gains(10.0, 6.0, 5.0))
+    ]
+    assert apart[0] > 0.02
+    assert apart[1] < 0.002
+
+
+def test_the_nearest_drive_is_the_closest_of_those_that_follow():
+    wild, limits = _wild()
+    least = errors(wild, nearest(wild, limits), limits).max(axis=1)
+    for gains in (Gains(0.0, 0.0, 0.0), Gains(25.0, 0.0, 0.0), Gains(10.0, 6.0, 5.0)):
+        one = errors(wild, follow(wild, limits, gains), limits).max(axis=1)
+        assert (least <= one + 1e-12).all()
+        assert (least < one).any()
+
+
+def test_errors_count_until_the_step_in_which_a_robot_spins():
+    limits = LIMITS._replace(max_yaw_rate=3.0)
+    near = _rolling(np.full((1, 6), 0.5), np.array([[0.0, 1.0, 2.0, 4.0, 1.0, 1.0]]), limits)
+    moved = near._replace(position=near.position + np.array([0.0, 0.03, 0.0]))
+    time = limits.ctrl_dt * np.arange(4) + ERROR_TIME
+    expected = [*(0.03 / time), 0.0, 0.0]
+    np.testing.assert_allclose(errors(moved, near, limits)[0], expected, rtol=1e-9)
+
+
+def test_once_a_robot_spins_its_velocity_on_the_floor_changes():
+    limits = LIMITS._replace(max_yaw_rate=3.0, slip=0.0)
+    near = _rolling(np.full((2, 5), 0.5), np.array([[0, 0, 9.0, 0, 0], [0.0] * 5]), limits)
+    # The first robot spins from step 2 on, and drives as before but for a push to the left.
+    moved = near._replace(heading=np.zeros((2, 5)), sideways=np.array([[0, 0, 0, 0.1, 0.3]] * 2))
+    near = near._replace(yaw_rate=np.array([[0, 0, 9.0, 0, 0], [0.0] * 5]))
+    begin = 0.5 * np.array([np.cos(9.0 * 0.005), np.sin(9.0 * 0.005)])
+    grip, growth = once_spun(moved, near, limits)
+    pushed = np.array([[0.5, 0.1], [0.5, 0.3]])
+    changes = np.linalg.norm(pushed - begin, axis=1) / (limits.ctrl_dt * np.array([1, 2]))
+    faster = (np.linalg.norm(pushed, axis=1) - 0.5) / np.array([1, 2])
+    np.testing.assert_allclose(grip, [changes.max(), 0.0], rtol=1e-9)
+    np.testing.assert_allclose(growth, [faster.max(), 0.0], rtol=1e-9)
 
 
 # In the simulator.
@@ -158,6 +212,24 @@ def _stored(preset):
     values = json.loads(BOUND_FILE.read_text())["searches"]
     one = next(one for one in values if one["settings"]["robot.preset"] == preset)
     return Limits(**one["limits"]), one["reach"]
+
+
+def _shares(driven, limits):
+    """Return, by its name, how much of each limit every drive uses."""
+    near = nearest(driven, limits)
+    calm = within(near, limits.max_yaw_rate, limits.max_turn)
+    wheel = near.speed + limits.half_track * np.abs(near.yaw_rate)
+    speed = np.where(calm, near.speed, np.hypot(driven.speed, driven.sideways))
+    shares = {
+        "error": errors(driven, near, limits).max(axis=1) / limits.error,
+        "max_speed": speed.max(axis=1) / limits.max_speed,
+        "min_speed": (near.speed * calm).min(axis=1) / limits.min_speed,
+        "max_wheel_speed": (wheel * calm).max(axis=1) / limits.max_wheel_speed,
+    }
+    if np.isinf(limits.max_turn):
+        return shares | {"max_yaw_rate": np.abs(near.yaw_rate).max(axis=1) / limits.max_yaw_rate}
+    grip, growth = once_spun(driven, near, limits)
+    return shares | {"grip": grip / limits.grip, "spun_step": growth / limits.spun_step}
 
 
 @pytest.mark.slow
@@ -171,16 +243,8 @@ def test_other_drives_keep_to_the_limits_and_never_beat_the_bound(preset):
     assert isinstance(found, Limits)
     assert found.step / MARGIN <= limits.step
     assert found.motor_yaw_rate / MARGIN <= limits.motor_yaw_rate
-    near = follow(driven, limits)
-    calm = within(near, limits.max_yaw_rate, limits.max_turn)
-    assert near.speed[calm].max() <= limits.max_speed
-    assert near.speed[calm].min() >= limits.min_speed
-    wheel = near.speed + limits.half_track * np.abs(near.yaw_rate)
-    assert wheel[calm].max() <= limits.max_wheel_speed
-    apart = np.linalg.norm(path(near, limits) - driven.position[..., :2], axis=-1)
-    time = np.arange(steps + 1) * env.dt + ERROR_TIME
-    assert (apart / time)[calm].max() <= limits.error
-    assert found.grip <= 1.2 * limits.grip
+    for name, share in _shares(driven, limits).items():
+        assert share.max() <= 1, name
     # On this floor and two others.
     table = farthest(limits, steps, Grid(2 if preset == "isaac" else 4, 60))
     angles = np.arange(60) * 2 * np.pi / 60
@@ -237,3 +301,27 @@ def test_optimised_commands_do_not_beat_the_bound():
             mean, spread = best.mean(axis=0), np.maximum(best.std(axis=0), 0.02)
             assert far.max() <= table[steps, direction]
         assert far.max() > 0.6 * table[steps, direction] - 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", CONFIGS)
+def test_optimised_commands_keep_to_the_limits(preset):
+    """The cross-entropy method looks for commands that use most of each limit."""
+    env, steps, pieces = make_jetbot_env(load_config(CONFIGS[preset])), 104, 9
+    limits, _ = _stored(preset)
+    rng, time = np.random.default_rng(1), np.arange(104)
+    names = ["error", "min_speed", "error" if preset == "real" else "grip"]
+    mean, spread = np.zeros((3, pieces, 3)), np.full((3, pieces, 3), 1.5)
+    for _ in range(24):
+        # Pieces of constant actions; the last number makes a piece long.
+        drawn = mean[:, None] + spread[:, None] * rng.standard_normal((3, 192, pieces, 3))
+        long = np.exp(np.clip(drawn[..., 2], -4, 4))
+        ends = steps * np.cumsum(long, axis=-1) / long.sum(axis=-1, keepdims=True)
+        piece = (time[:, None] >= ends[:, :, None, :-1]).sum(axis=-1)
+        actions = np.take_along_axis(np.clip(drawn[..., :2], -1, 1), piece[..., None], axis=2)
+        shares = _shares(drive(env, actions.reshape(-1, steps, 2).astype(np.float32)), limits)
+        for name, share in shares.items():
+            assert share.max() <= 1, name
+        for i, name in enumerate(names):
+            best = drawn[i][np.argsort(-shares[name][192 * i : 192 * (i + 1)])[:24]]
+            mean[i], spread[i] = best.mean(axis=0), np.maximum(best.std(axis=0), 0.1)

@@ -7,29 +7,8 @@ import pytest
 
 from benchmarks.learning.reachable import ERROR_TIME, Grid, Limits, farthest, least_steps
 from jetbot_mjx.evaluation.best_known import BOUND_FILE, FILE
+from tests.helpers.limits import PLAIN
 
-PLAIN = Limits(
-    ctrl_dt=1 / 30,
-    track=0.05,
-    step=0.06,
-    brake=1.0,
-    swing=0.0,
-    drag=0.0,
-    outer_loss=0.0,
-    inner_loss=0.0,
-    max_speed=0.6,
-    min_speed=0.0,
-    motor_yaw_rate=3.0,
-    growth=0.0,
-    max_yaw_rate=3.0,
-    max_turn=np.inf,
-    grip=10.0,
-    half_track=0.06,
-    max_wheel_speed=np.inf,
-    lateness=0.75,
-    slip=0.0,
-    error=0.0,
-)
 SPINNING = PLAIN._replace(
     swing=4.0,
     drag=0.013,
@@ -38,6 +17,7 @@ SPINNING = PLAIN._replace(
     brake=1.3,
     growth=1.5,
     max_yaw_rate=5.5,
+    spun_step=0.07,
     slip=0.02,
     max_wheel_speed=0.8,
 )
@@ -122,7 +102,7 @@ def test_no_robot_that_spins_gets_farther():
             aside = -limits.slip * speed * turn
             along = speed * np.cos(a - angle) - aside * np.sin(a - angle)
             steps = np.arange(STEPS + 1 - start)
-            fast = np.hypot(speed, aside) + limits.step * steps
+            fast = np.hypot(speed, aside) + limits.spun_step * steps
             rate = np.minimum(along + limits.grip * dt * steps, np.minimum(fast, limits.max_speed))
             moved = np.cumsum(dt * (0.25 * rate[:-1] + 0.75 * rate[1:]))
             far = path[start, one] @ [np.cos(angle), np.sin(angle)] + moved

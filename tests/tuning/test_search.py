@@ -382,7 +382,9 @@ def test_without_final_trainings_the_best_trial_is_the_best(tmp_path):
     path = results.write_results(tmp_path, CONFIG, one, [])
     best = one.study.best_trial.params["ppo.learning_rate"]
     assert load_config(path).ppo.learning_rate == best
-    assert (tmp_path / "trials.md").read_text().startswith("| trial |")
+    table = (tmp_path / "trials.md").read_text()
+    assert table.startswith("| trial |")
+    assert table.count("\n| 0 (as given) |") == table.count("as given") == 1
 
 
 def test_the_best_configuration_has_its_robots_model_beside_it(tmp_path, monkeypatch):

@@ -115,7 +115,7 @@ def test_a_trial_that_is_ended_leaves_the_others_as_they_were(trials, outcomes):
     assert kept.scores == outcomes[1].scores
     for ours, theirs in zip(leaves(kept.params), leaves(outcomes[1].params), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4)
-    assert shown[0] == "compiling the training of 4 policies"
+    assert shown[0] == "compiling the training of up to 4 policies"
     first = trials.run(VALUES, [3, 3, 4], lambda trial, outcome: False)
     assert [one.scores for one in first] == [one.scores[:1] for one in outcomes]
 
@@ -123,7 +123,7 @@ def test_a_trial_that_is_ended_leaves_the_others_as_they_were(trials, outcomes):
 def test_compiling_and_training_are_stages_that_a_command_shows(trials):
     with noted_stages() as shown:
         trials.run(VALUES, [3, 3, 4])
-    assert shown == ["compiling the training of 4 policies", "intervals of training 3 policies"]
+    assert shown == ["compiling the training of up to 4 policies", "training 3 policies, intervals"]
 
 
 @pytest.mark.slow
