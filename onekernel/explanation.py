@@ -39,7 +39,9 @@ def explain(function: Callable[..., PyTree], *arguments: PyTree, **keywords: PyT
         ("traced and lowered in", f"{seconds:.2f} s"),
     ]
     backend = default_backend()
-    obstacle = "no kernels for this device" if backend is None else backend.obstacle()
+    obstacle = "no kernels for this device"
+    if backend is not None:
+        obstacle = backend.obstacle() or backend.refusal(kernel)
     if backend is None or obstacle:
         rows.append(("compiled", f"not here: {obstacle}"))
     else:
@@ -55,5 +57,4 @@ def explain(function: Callable[..., PyTree], *arguments: PyTree, **keywords: PyT
 
 
 def _operations(kernel: Kernel) -> int:
-    programs = (kernel.before, kernel.program, kernel.after)
-    return sum(program.size for program in programs if program is not None)
+    return sum(program.size for program in kernel.programs)

@@ -424,7 +424,8 @@ class _Lowered:
         # That is for many instances: around a single one, XLA has little to compile.
         backend = default_backend()
         assert isinstance(self.one, Kernel)
-        if backend and self.one.impl in ("auto", backend.IMPL) and not backend.obstacle():
+        is_meant = backend and self.one.impl in ("auto", backend.IMPL) and not backend.obstacle()
+        if backend and is_meant and not backend.refusal(self.one):
             backend.prepare(self.one)
 
     def check(self) -> None:

@@ -117,8 +117,8 @@ class Kernel:
         Raises:
           UnsupportedError: one of them has an operation that has no LLVM instruction.
         """
-        for program in (self.before, self.program, self.after):
-            if program is not None and not isinstance(program, LateProgram):
+        for program in self.programs:
+            if not isinstance(program, LateProgram):
                 require(program)
 
     @functools.cached_property
@@ -194,6 +194,16 @@ class Kernel:
         return list(map(math.prod, (self.after or self.program).output_shapes))
 
     @property
+    def programs(self) -> list[ScalarProgram]:
+        """Return what runs before the first step, the step, and what runs after the last one."""
+        return [x for x in (self.before, self.program, self.after) if x is not None]
+
+    @property
+    def array_bytes(self) -> int:
+        """Return the bytes of memory that the arrays of one instance, or item, take."""
+        return max(program.array_bytes for program in self.programs)
+
+    @property
     def _taken(self) -> list[tuple[int, ...]]:
         """Return the shapes of the arguments as the first program takes them."""
         shapes = (self.before or self.program).input_shapes
@@ -261,6 +271,10 @@ class Backend(Protocol):
 
     def obstacle(self) -> str | None:
         """Return why kernels cannot run in this process, with the remedy, or None if they can."""
+        ...
+
+    def refusal(self, kernel: Kernel) -> str | None:
+        """Return why this kernel cannot run although others can, or None if it can."""
         ...
 
     def prepare(self, kernel: Kernel) -> None:
@@ -471,6 +485,18 @@ def probe(
         return None if correct else "a small kernel returned wrong numbers"
 
 
+def _obstacle(backend: Backend | None, kernel: Kernel) -> str | None:
+    """Return why a back end cannot run a kernel, or None if it can."""
+    if kernel.impl not in ("auto", backend and backend.IMPL):
+        return f"this program is for {backend.PLATFORM if backend else 'another platform'}"
+    if backend is None:
+        return "there are no kernels for this platform"
+    if obstacle := backend.obstacle():
+        return obstacle
+    reason = kernel.unsupported or backend.refusal(kernel)
+    return f"one kernel cannot do {reason}" if reason else None
+
+
 def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
     """Return the function that JAX lowers for a back end's platform; None: all other platforms."""
 
@@ -484,21 +510,16 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
             for x, shape in zip(leaves, kernel.argument_shapes, strict=True)
         ]
         # Run the kernel where its back end is allowed and works, the fallback where `auto` permits.
-        usable = backend and kernel.impl in ("auto", backend.IMPL) and not backend.obstacle()
-        if backend and usable and not kernel.unsupported:
+        obstacle = _obstacle(backend, kernel)
+        if backend and not obstacle:
             table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
             results = backend.launch(kernel, [*flat, *table])
-        elif kernel.impl == "auto":
-            obstacle = backend.obstacle() if backend else "there are no kernels for this platform"
-            if usable:
-                obstacle = f"one kernel cannot do {kernel.unsupported}"
+        elif obstacle and kernel.impl == "auto":
             # The fallback is written for one instance. It may raise an error of JAX's.
             results = jax.vmap(lambda *leaves: kernel.fallback(*leaves))(*flat)
-            if obstacle:
-                kernel.on_fallback(obstacle)
+            kernel.on_fallback(obstacle)
         else:
-            platform = backend.PLATFORM if backend else "another platform"
-            raise kernel.explain(KernelError(f"this program is for {platform}", "platform"))
+            raise kernel.explain(KernelError(str(obstacle), "platform"))
         wanted = kernel.results(*batch)
         return [x.reshape(like.shape) for x, like in zip(results, wanted, strict=True)]
 

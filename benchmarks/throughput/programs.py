@@ -7,9 +7,8 @@ these are known and one kernel allows them. These differ:
 - The reports of `quasiseparable_cholesky`, `mass_matrix`, `neuron` and `orbits` compute in float64.
   The first says that float32 is not slow.
 - `mass_matrix` has 35 joints in its report, which are more than 100,000 operations here.
-- `scalar_nodes`, `neuron` and `orbits` are differentiated in theirs. `scalar_nodes_gradient` and
-  `neuron_gradient` are, too: a step is computed again, and so is each group of steps, since what a
-  gradient stores of all steps is more than 64 KiB. XLA, which has the memory, computes none again.
+- `scalar_nodes`, `neuron` and `orbits` are differentiated in theirs, as in `scalar_nodes_gradient`
+  and `neuron_gradient` here.
 - `search` has a table of 2²² numbers in its report, which is closed: XLA has become fast.
 - `orbits` takes leapfrog steps in place of Kepler's motion.
 
@@ -28,13 +27,12 @@ ever, where LAPACK's functions take all of its threads.
 """
 
 import argparse
-import math
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -101,14 +99,11 @@ def draw_systems(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray
 # Models with many single numbers.
 
 
-def scalar_nodes(
-    observed: Float[Array, "t"], scan: Any = jax.lax.scan
-) -> dict[str, Float[Array, ""]]:
+def scalar_nodes(observed: Float[Array, "t"]) -> dict[str, Float[Array, ""]]:
     """Filter a signal by a chain of 30 nodes, whose means and precisions are single numbers.
 
     Args:
       observed: the signal.
-      scan: `jax.lax.scan` or `scan_in_groups`.
 
     Returns:
       Mean and precision of each node at the end.
@@ -126,46 +121,14 @@ def scalar_nodes(
             error = 0.5 * error * predicted
         return after, None
 
-    return scan(one, first, observed)[0]
+    return jax.lax.scan(one, first, observed)[0]
 
 
-Step = Callable[[PyTree, Array], tuple[PyTree, PyTree]]
-
-
-def scan_in_groups(step: Step, carry: PyTree, rows: Array) -> tuple[PyTree, PyTree]:
-    """Compute `jax.lax.scan`, of whose steps a gradient stores few and computes the others again.
-
-    Args:
-      step: the step.
-      carry: what it begins with.
-      rows: one for each step.
-
-    Returns:
-      What the last step carries, and what all steps return.
-    """
-    size = math.isqrt(len(rows))
-    whole = len(rows) // size * size
-    one = jax.checkpoint(step)
-
-    @jax.checkpoint
-    def group(carry: PyTree, rows: Array) -> tuple[PyTree, PyTree]:
-        return jax.lax.scan(one, carry, rows)
-
-    groups = rows[:whole].reshape(-1, size, *rows.shape[1:])
-    carry, first = jax.lax.scan(group, carry, groups)
-    carry, last = group(carry, rows[whole:])
-
-    def join(groups: Array, last: Array) -> Array:
-        return jnp.concatenate([groups.reshape(whole, *last.shape[1:]), last])
-
-    return carry, jax.tree.map(join, first, last)
-
-
-def gradient(function: Callable[..., PyTree], **options: Any) -> Callable[[Array], Array]:
+def gradient(function: Callable[[Array], PyTree]) -> Callable[[Array], Array]:
     """Return the gradient of the sum of squares of all that a function returns."""
 
     def loss(x: Array) -> Array:
-        squares = [jnp.square(y).sum() for y in jax.tree.leaves(function(x, **options))]
+        squares = [jnp.square(y).sum() for y in jax.tree.leaves(function(x))]
         return jnp.stack(squares).sum()
 
     return jax.grad(loss)
@@ -217,7 +180,7 @@ def mass_matrix(angles: Float[Array, "joints"]) -> Float[Array, "joints joints"]
     return matrix
 
 
-def neuron(current: Float[Array, "t"], scan: Any = jax.lax.scan) -> Float[Array, "t"]:
+def neuron(current: Float[Array, "t"]) -> Float[Array, "t"]:
     """Simulate a cable of eight compartments with Hodgkin's and Huxley's channels.
 
     Args:
@@ -262,7 +225,7 @@ def neuron(current: Float[Array, "t"], scan: Any = jax.lax.scan) -> Float[Array,
         return (v, *opened), v[-1]
 
     rest = jnp.full(count, -65.0), jnp.full(count, 0.05), jnp.full(count, 0.6), jnp.full(count, 0.3)
-    return scan(one, rest, current)[1]
+    return jax.lax.scan(one, rest, current)[1]
 
 
 def orbits(velocities: Float[Array, "planets 3"]) -> Float[Array, "planets 3"]:
@@ -308,8 +271,6 @@ class Program(NamedTuple):
     """Draws its argument, for all instances."""
     num_instances: int = 1
     """Number of instances in the report."""
-    by_xla: Callable[[Array], PyTree] | None = None
-    """The same function as XLA computes it faster; None: as the kernel does."""
 
 
 def draw_currents(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
@@ -328,20 +289,9 @@ PROGRAMS = {
         small_solves, (3, 4), "jax-ml/jax/issues/36927", draw_systems, 182 * 474
     ),
     "scalar_nodes": Program(scalar_nodes, (614,), "jax-ml/jax/issues/40150"),
-    "scalar_nodes_gradient": Program(
-        gradient(scalar_nodes, scan=scan_in_groups),
-        (614,),
-        "jax-ml/jax/issues/40150",
-        by_xla=gradient(scalar_nodes),
-    ),
+    "scalar_nodes_gradient": Program(gradient(scalar_nodes), (614,), "jax-ml/jax/issues/40150"),
     "neuron": Program(neuron, (1000,), "jax-ml/jax/issues/26145", draw_currents),
-    "neuron_gradient": Program(
-        gradient(neuron, scan=scan_in_groups),
-        (1000,),
-        "jax-ml/jax/issues/26145",
-        draw_currents,
-        by_xla=gradient(neuron),
-    ),
+    "neuron_gradient": Program(gradient(neuron), (1000,), "jax-ml/jax/issues/26145", draw_currents),
     "mass_matrix": Program(mass_matrix, (20,), "jax-ml/jax/issues/26021"),
     "search": Program(
         search,
@@ -414,24 +364,22 @@ def measure(name: str, num_instances: int, rounds: int) -> Iterator[Row]:
     Yields:
       The row, without what XLA takes and then with it.
     """
-    function, shape, report, draw, _, by_xla = PROGRAMS[name]
+    function, shape, report, draw, _ = PROGRAMS[name]
     rng, is_one = np.random.default_rng(0), num_instances == 1
     argument = jnp.asarray(draw(rng, shape if is_one else (num_instances, *shape)))
     batch = (lambda f: f) if is_one else jax.vmap
-    # What computes steps again has a longer chain than a program must have.
-    has_bound = is_one and by_xla is None
     row, kernel = Row(name, f"https://github.com/{report}", num_instances), None
     try:
         kernel = Compiled(batch(fuse(function, on_unsupported="raise")), argument)
         row = row._replace(
             kernel_seconds=statistics.median(kernel.shortest() for _ in range(rounds)),
             kernel_compile_seconds=kernel.compile_seconds,
-            bound_seconds=lower_bound(function, argument, measure_times()) if has_bound else None,
+            bound_seconds=lower_bound(function, argument, measure_times()) if is_one else None,
         )
     except UnsupportedError as error:
         row = row._replace(note=str(error))
     yield row
-    xla = Compiled(batch(by_xla or function), argument)
+    xla = Compiled(batch(function), argument)
     times: dict[str, list[float]] = {"xla": [], "kernel": []}
     for _ in range(rounds):
         times["xla"].append(xla.shortest())

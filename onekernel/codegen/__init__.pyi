@@ -1,6 +1,7 @@
 from .llvm import STEP as STEP
 from .llvm import ProgramWriter as ProgramWriter
 from .llvm import map_function as map_function
+from .llvm import memory_bytes as memory_bytes
 from .llvm import require as require
 from .llvm import run_program as run_program
 from .llvm import tile_function as tile_function

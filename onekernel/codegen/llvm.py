@@ -10,10 +10,12 @@ A lane that ends earlier keeps its values, and its results do not depend on the 
 of a branch is skipped only if no lane takes it. A mask says which lanes execute a block: those that
 have left an enclosing loop, or took the other side of an enclosing branch, do not count.
 
-An array is in memory of the function, where on a CPU a vector holds an element for all lanes. In a
-counted loop, all lanes are in the same iteration, so one load or store serves them; by any other
-index, each lane loads its element alone. Lanes that do not execute a block store whatever they
-have: they do not load it again, because a load is inside of the block that stores.
+An array is in memory, where on a CPU a vector holds an element for all lanes. In a counted loop,
+all lanes are in the same iteration, so one load or store serves them; by any other index, each lane
+loads its element alone. Lanes that do not execute a block store whatever they have: they do not
+load it again, because a load is inside of the block that stores. In the memory of a CPU, what an
+iteration stores is side by side: arrays one behind the other would be hundreds of pages that are
+written in turns.
 
 Source: LLVM Language Reference Manual.
 """
@@ -21,6 +23,7 @@ Source: LLVM Language Reference Manual.
 import functools
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,13 +73,24 @@ def run_program(
     return list(ProgramWriter(writer, program, for_gpu=for_gpu).finish(arguments))
 
 
+def memory_bytes(program: ScalarProgram, lanes: int) -> int:
+    """Return the bytes of memory, a multiple of 64, that a program's arrays take.
+
+    Args:
+      program: the program.
+      lanes: the number of instances or items that run it side by side.
+    """
+    return sum(_size_of(together, lanes) for together in program.block.arrays())
+
+
 def tile_function(
     program: ScalarProgram, *, lanes: int, name: str, rows: Sequence[int]
 ) -> LlvmWriter:
     """Write a function that runs a program on a tile.
 
     The function's parameter is the address of a tile, whose rows are `lanes` float32 values, one of
-    each instance, and are aligned to their size. The results are written to the first rows.
+    each instance, and are aligned to their size. The results are written to the first rows. If the
+    program has arrays, a second one is the address of `memory_bytes`, aligned to 64 bytes.
 
     Args:
       program: the program.
@@ -89,8 +103,9 @@ def tile_function(
     """
     # `noalias` promises LLVM that no other address reaches this memory, so it may reorder loads and
     # stores.
-    w = LlvmWriter(name, "ptr noalias tile", lanes=lanes, keeps_blocks=lanes == 1)
-    (tile,) = w.parameters
+    names = ("ptr noalias tile", *_memory_parameter(program))
+    w = LlvmWriter(name, *names, lanes=lanes, keeps_blocks=lanes == 1)
+    tile, *memory = w.parameters
 
     def load(row: int) -> Value:
         return tile.at(row, w.vector).load(w.vector, align=4 * lanes)
@@ -98,8 +113,10 @@ def tile_function(
     program = ordered(program)
     # An argument that goes to an array is loaded when it is stored there: of thousands of them, few
     # wait in registers. One that is a result, too, must be loaded before results replace it.
-    body = ProgramWriter(w, program)
-    in_arrays = _sources(x for array in program.block.arrays() for x in array.operands)
+    body = ProgramWriter(w, program, memory=memory[0] if memory else None)
+    in_arrays = _sources(
+        x for together in program.block.arrays() for array in together for x in array.operands
+    )
     in_arrays -= _sources(x for array in program.outputs for x in array.ravel())
     scalars = [x for array in program.inputs for x in array.ravel()]
     arguments = [
@@ -112,6 +129,11 @@ def tile_function(
     return w
 
 
+def _memory_parameter(program: ScalarProgram) -> list[str]:
+    """Return the parameter of a function that runs a program with arrays; without, none."""
+    return ["ptr noalias memory"] if any(program.block.arrays()) else []
+
+
 def _sources(scalars: Iterable[Scalar]) -> set[int]:
     """Return the indices of the scalars from which some words are converted."""
     return {x.index for x in map(_source, scalars) if not is_constant(x)}
@@ -122,7 +144,8 @@ def map_function(program: ScalarProgram, *, lanes: int, items: int) -> LlvmWrite
 
     The parameters of the function are the addresses of an instance's arguments, one after the
     other, of the table with a row of `items` values for each scalar of the program's last argument,
-    all float32, and of the results, bytes of one item after the other.
+    all float32, and of the results, bytes of one item after the other; and that of memory for
+    arrays as for `tile_function`.
 
     Args:
       program: the function of (arguments of an instance ..., a column of the table), with scalar
@@ -135,10 +158,11 @@ def map_function(program: ScalarProgram, *, lanes: int, items: int) -> LlvmWrite
     """
     *shared, row = [array.size for array in program.inputs]
     names = (*(f"in{i}" for i in range(len(shared))), "table", "out")
-    w = LlvmWriter(STEP, *(f"ptr noalias {name}" for name in names), lanes=lanes)
-    *arrays, table, out = w.parameters
+    parameters = [*(f"ptr noalias {name}" for name in names), *_memory_parameter(program)]
+    w = LlvmWriter(STEP, *parameters, lanes=lanes)
+    arrays, (table, out, *memory) = w.parameters[: len(shared)], w.parameters[len(shared) :]
     # Load the arguments that the items share, and compute the operations on these alone, once.
-    body = ProgramWriter(w, program)
+    body = ProgramWriter(w, program, memory=memory[0] if memory else None)
     body.hoist(
         array[j].splat(lanes)
         for array, size in zip(arrays, shared, strict=True)
@@ -196,6 +220,27 @@ def _inputs(program: ScalarProgram, *, is_part: bool = False) -> list[Expr]:
     return inputs
 
 
+class _Array(NamedTuple):
+    """An `_Array` is where the numbers of an array are."""
+
+    rows: Value
+    """The address of the first row."""
+    row: str
+    """A type of the size of a row."""
+    offset: int = 0
+    """Bytes in a row before the number of the array, of all lanes."""
+
+
+def _row_bytes(together: Sequence[Expr], lanes: int) -> int:
+    """Return the bytes of a row: a number of each array."""
+    return lanes * sum(x.dtype.itemsize for x in together)
+
+
+def _size_of(together: Sequence[Expr], lanes: int) -> int:
+    """Return the bytes of arrays whose numbers are side by side, a multiple of 64."""
+    return 64 * -(-length_of(together[0]) * _row_bytes(together, lanes) // 64)
+
+
 class ProgramWriter:
     """A `ProgramWriter` appends the operations of one program to a function."""
 
@@ -207,6 +252,7 @@ class ProgramWriter:
         fast_division: bool = False,
         for_gpu: bool = False,
         is_part: bool = False,
+        memory: Value | None = None,
     ) -> None:
         """Begin without values.
 
@@ -218,6 +264,8 @@ class ProgramWriter:
           for_gpu: whether the function is for an NVIDIA GPU. Only such a function can run a program
             that `scalarize` has lowered with `approximate`.
           is_part: whether arguments of other dtypes are given as such.
+          memory: the address of memory for arrays, as for `tile_function`; None: they are on the
+            stack of the thread.
 
         Raises:
           UnsupportedError: an argument is not float32.
@@ -228,8 +276,11 @@ class ProgramWriter:
         self._program = program
         self._rest: list[Item] = program.block.items
         self._values: dict[int, Value | Callable[[], Value]] = {}
-        # The addresses of arrays, and the counters of loops, one number for all lanes.
-        self._addresses: dict[int, Value] = {}
+        # The arrays, how many bytes of the memory they take, and the counters of loops, one number
+        # for all lanes.
+        self._arrays: dict[int, _Array] = {}
+        self._rows: dict[tuple[str, str, str], Value] = {}
+        self._memory, self._taken = memory, 0
         self._counters: dict[int, Value] = {}
         # The values that the current loops compute again instead of keeping them in registers, and
         # what has been computed again so far, by the index of the value and the basic block.
@@ -329,8 +380,7 @@ class ProgramWriter:
         counter, length = loop.counter, loop.length
         assert counter is not None
         assert length is not None
-        for stack in item.stacks:
-            self._addresses[stack.index] = self._allocated(stack)
+        self._allocate(item.stacks)
         # As in `_loop`, but the counter alone decides. Lanes that do not execute the enclosing
         # block go through the iterations, too, and nobody takes their values.
         carries = [loop.carries[place] for place in item.places]
@@ -464,25 +514,49 @@ class ProgramWriter:
 
     # Arrays.
 
-    def _allocated(self, array: Expr) -> Value:
-        """Return the address of memory for the scalars of an array."""
-        type, align = self._on.type(array.dtype), self._alignment(array.dtype)
-        return self._writer.allocate(length_of(array), type, align=align)
+    def _allocate(self, together: Sequence[Expr]) -> None:
+        """Take memory for arrays of one length, whose numbers are side by side."""
+        w = self._writer
+        if self._memory is None:
+            for array in together:
+                type, align = self._on.type(array.dtype), self._alignment(array.dtype)
+                rows = w.allocate(length_of(array), type, align=align)
+                self._arrays[array.index] = _Array(rows, type)
+        elif together:
+            rows = self._memory.at(self._taken, "u8")
+            row, offset = f"[{_row_bytes(together, w.lanes)} x i8]", 0
+            for array in together:
+                self._arrays[array.index] = _Array(rows, row, offset)
+                offset += array.dtype.itemsize * w.lanes
+            self._taken += _size_of(together, w.lanes)
+
+    def _address(self, array: _Array, place: Value | int) -> Value:
+        """Return the address of a number of an array, of all lanes."""
+        # Compute the address of a row once in a basic block: its numbers are at constant distances.
+        # LLVM finds that out for few arrays, and keeps an address for each of many.
+        text = place.text if isinstance(place, Value) else str(place)
+        key = array.rows.text, text, self._writer.label
+        if key not in self._rows:
+            self._rows[key] = array.rows.at(place, array.row)
+        row = self._rows[key]
+        return row.at(array.offset, "u8") if array.offset else row
 
     def _alignment(self, dtype: np.dtype) -> int:
         """Return the bytes to which numbers of all lanes are aligned in an array."""
-        return dtype.itemsize * self._writer.lanes
+        # In a row, wide numbers may be behind a narrow one.
+        return (dtype.itemsize if self._memory is None else 4) * self._writer.lanes
 
     def _store(self, array: Expr, place: Value | int, value: Value) -> None:
-        address = self._addresses[array.index].at(place, value.type)
+        address = self._address(self._arrays[array.index], place)
         address.store(value, align=self._alignment(array.dtype))
 
     def _array(self, array: Expr) -> None:
         """Append an array of given scalars."""
         if is_table(array):
-            self._addresses[array.index] = self._table(array)
+            element = ELEMENTS[array.dtype]
+            self._arrays[array.index] = _Array(self._table(array), element)
             return
-        self._addresses[array.index] = self._allocated(array)
+        self._allocate([array])
         for i, x in enumerate(array.operands):
             self._writer.divide(i)
             self._store(array, i, self._operand(x))
@@ -510,24 +584,25 @@ class ProgramWriter:
         w = self._writer
         array, index = value.operands
         assert isinstance(array, Expr)
-        address, is_one = self._addresses[array.index], is_table(array)
+        numbers, is_one = self._arrays[array.index], is_table(array)
         element, vectors = ELEMENTS[value.dtype], self._on.type(value.dtype)
         # A constant or a counter is the same in all lanes: load the vector of all of them, or the
         # one number of a table.
         if is_constant(index) or index.op == "counter":
             place = int(index) if is_constant(index) else self._counters[index.index]
             if is_one:
-                return address.at(place, element).load(element).splat(w.lanes)
-            return address.at(place, vectors).load(vectors, align=self._alignment(value.dtype))
-        places = self._operand(index)
+                return self._address(numbers, place).load(element).splat(w.lanes)
+            return self._address(numbers, place).load(vectors, align=self._alignment(value.dtype))
+        places, align = self._operand(index), None if is_one or self._memory is None else 4
         if w.lanes == 1:
-            return address.at(places, element).load(element)
+            return self._address(numbers, places).load(element, align=align)
         # Otherwise each lane loads its own number, which in memory is among those of its vector.
         result = Value(w, "poison", vectors)
         for lane in range(w.lanes):
             place = w.let(f"extractelement {places.typed}, i64 {lane}", "i32")
-            word = place if is_one else place * w.lanes + lane
-            number = address.at(word, element).load(element)
+            address = self._address(numbers, place)
+            address = address if is_one else address.at(lane, element)
+            number = address.load(element, align=align)
             result = w.let(
                 f"insertelement {llvm_type(vectors)} {result.text}, {number.typed}, i64 {lane}",
                 vectors,

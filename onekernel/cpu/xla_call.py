@@ -14,8 +14,17 @@ import contextlib
 from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
 
-from onekernel.codegen import STEP, LlvmWriter, Value, map_function, module_text, tile_function
+from onekernel.codegen import (
+    STEP,
+    LlvmWriter,
+    Value,
+    map_function,
+    memory_bytes,
+    module_text,
+    tile_function,
+)
 from onekernel.kernel import Kernel
+from onekernel.lower import ScalarProgram
 
 VERSION = (0, 3)
 """Version of XLA's foreign function interface that `xla_call.ll` is written for."""
@@ -66,8 +75,22 @@ def kernel_text(kernel: Kernel, *, lanes: int, machine: str) -> str:
         functions,
         instances_per_block=instances,
         blocks_per_thread=_BLOCKS_PER_THREAD,
+        scratch=scratch_bytes(kernel, lanes),
         machine=machine,
     )
+
+
+def scratch_bytes(kernel: Kernel, lanes: int) -> int:
+    """Return the bytes of scratch memory that a block of a kernel takes, a multiple of 64.
+
+    Its arrays are there: the stack of a thread is too small for them.
+
+    Args:
+      kernel: the kernel.
+      lanes: the number of instances or items that run side by side.
+    """
+    # One part runs after the other.
+    return max(memory_bytes(program, lanes) for program in kernel.programs)
 
 
 def call_text(
@@ -140,12 +163,13 @@ def job_of_one(arrays: Sequence[Value]) -> Value:
 def _step_block(kernel: Kernel, lanes: int) -> LlvmWriter:
     """Write the function that takes a block of instances through all steps."""
     w = LlvmWriter("block", *BLOCK_PARAMETERS)
-    job, index, _ = w.parameters
+    job, index, scratch = w.parameters
     instances = instance_count(job)
     first = index * lanes
     # `block` reads the addresses from the job; `instances` does the work and knows nothing of jobs.
     arrays = range(len(kernel.argument_shapes) + len(kernel.results()))
-    w.call("instances", *(array_of(job, i) for i in arrays), first, instances)
+    memory = [scratch] if scratch_bytes(kernel, lanes) else []
+    w.call("instances", *(array_of(job, i) for i in arrays), first, instances, *memory)
     return w
 
 
@@ -153,8 +177,8 @@ def step_functions(kernel: Kernel, lanes: int) -> list[LlvmWriter]:
     """Write a function that takes instances through all steps of a kernel, and those that it calls.
 
     It is called `instances`, and takes the addresses of the arguments and results, arrays of all
-    instances, the first instance, and how many instances there are; it steps as many as there are
-    lanes.
+    instances, the first instance, and how many instances there are, and that of `scratch_bytes`,
+    aligned to 64 bytes, if there are any; it steps as many as there are lanes.
 
     Args:
       kernel: the kernel, without a table.
@@ -195,8 +219,10 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
     """
     sizes, results = kernel.argument_words, kernel.result_words
     names = [f"ptr a{i}" for i in range(len(sizes) + len(results))]
-    w = LlvmWriter("instances", *names, "u64 first", "u64 instances", lanes=lanes)
-    *arrays, first, instances = w.parameters
+    parameters = [*names, "u64 first", "u64 instances"]
+    parameters += ["ptr memory"] if scratch_bytes(kernel, lanes) else []
+    w = LlvmWriter("instances", *parameters, lanes=lanes)
+    arrays, (first, instances, *memory) = w.parameters[: len(names)], w.parameters[len(names) :]
     # Rows of the tile are scalars, columns are instances.
     tile = w.let(f"alloca [{height} x {w.vector}], align {4 * lanes}", "ptr")
     zero, last = w.constant(0, "u64"), instances - 1
@@ -218,15 +244,15 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
         loop.again(following < lanes, following)
     # Step.
     if kernel.before is not None:
-        w.call("before", tile)
+        _run("before", kernel.before, tile, memory)
     with w.repeat(zero) as loop:
         # The results overwrite the rows of the carried arguments; the other arguments stay for the
         # next step.
-        w.call(STEP, tile)
+        _run(STEP, kernel.program, tile, memory)
         following = loop.carried[0] + 1
         loop.again(following < kernel.steps, following)
     if kernel.after is not None:
-        w.call("after", tile)
+        _run("after", kernel.after, tile, memory)
     # Copy the results from the tile.
     with w.repeat(zero) as loop:
         (lane,) = loop.carried
@@ -242,6 +268,12 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
         # Do not store the lanes beyond the last instance.
         loop.again((following < lanes) & (instance + 1 < instances), following)
     return w
+
+
+def _run(name: str, program: ScalarProgram, tile: Value, memory: Sequence[Value]) -> None:
+    """Append a call of a `tile_function`, with memory if the program has arrays."""
+    w = tile.writer
+    w.call(name, tile, *(memory if memory_bytes(program, w.lanes) else []))
 
 
 @contextlib.contextmanager
@@ -261,11 +293,13 @@ def _indices(w: LlvmWriter, size: int) -> Iterator[Iterable[Value | int]]:
 def _map_functions(kernel: Kernel, items: int, lanes: int) -> list[LlvmWriter]:
     """Write the function that computes all items of an instance, and the one that it calls."""
     w = LlvmWriter("block", *BLOCK_PARAMETERS)
-    job, index, _ = w.parameters
+    job, index, scratch = w.parameters
     # All instances share the table, which stands between the arguments and the results.
     # Bytes from one instance to the next in each array: float32 arguments, the table, the results.
     rows = [*(4 * words for words in kernel.argument_words), 0]
     rows.append(items * len(kernel.program.outputs))
     arrays = [array_of(job, i) for i in range(len(rows))]
-    w.call(STEP, *(array.at(index * size, "u8") for array, size in zip(arrays, rows, strict=True)))
+    addresses = [array.at(index * size, "u8") for array, size in zip(arrays, rows, strict=True)]
+    memory = [scratch] if scratch_bytes(kernel, lanes) else []
+    w.call(STEP, *addresses, *memory)
     return [map_function(kernel.program, lanes=lanes, items=items), w]

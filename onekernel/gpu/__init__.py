@@ -65,6 +65,10 @@ _FULL_BLOCKS = 2**31 - 1
 thread reaches this number, so one text serves all such launches, and the driver assembles it once.
 """
 
+MAX_ARRAY_BYTES = 64 * 1024
+"""Most memory for the arrays of one instance: a GPU reserves as much for every thread that it can
+hold, which on an H100 are 270,000."""
+
 _NUM_REGS, _LOCAL_SIZE_BYTES = 4, 3
 """Attributes of a function, by their numbers in CUDA's driver API (`CUfunction_attribute`)."""
 
@@ -84,6 +88,14 @@ def obstacle() -> str | None:
     except (ImportError, OSError, RuntimeError) as error:
         return f"llvmlite cannot be used ({error}): pip install llvmlite"
     return probe(launch, device, instances=2)
+
+
+def refusal(kernel: Kernel) -> str | None:
+    """Return why a kernel cannot run, as specified by `onekernel.kernel.Backend`."""
+    count = kernel.array_bytes
+    if count <= MAX_ARRAY_BYTES:
+        return None
+    return f"arrays of {count:,} bytes for each instance, more than {MAX_ARRAY_BYTES:,} on a GPU"
 
 
 def prepare(kernel: Kernel) -> None:

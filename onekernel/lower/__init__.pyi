@@ -1,5 +1,4 @@
 from .angles import far_angle as far_angle
-from .control_flow import MAX_ARRAY_BYTES as MAX_ARRAY_BYTES
 from .control_flow import call_of as call_of
 from .control_flow import scan_ends as scan_ends
 from .evaluation import evaluate as evaluate

@@ -47,9 +47,9 @@ MAX_UNROLLED_SCAN_OPERATIONS = 16_384
 """Largest number of operations of an unrolled scan with sequences that could be a loop: as a loop,
 it keeps them in memory. LLVM takes 2 s to compile that many for a CPU."""
 
-MAX_ARRAY_BYTES = 64 * 1024
-"""Most memory for the arrays of one instance: the lanes of a CPU have up to 1 MiB together on the
-stack of a thread, and a GPU reserves it for every thread that it can hold."""
+MAX_ARRAY_BYTES = 4 << 20
+"""Most memory for the arrays of one instance, about as many numbers as operations may be recorded.
+Platforms may allow less."""
 
 MIN_BRANCH_OPERATIONS = 24
 """Smallest number of operations for which a branch is faster than computing both sides."""
@@ -65,10 +65,14 @@ CALLS = frozenset(
 """Names of the primitives that call a function once."""
 
 
+class _TooLargeError(UnsupportedError):
+    """Raised when arrays take too much memory."""
+
+
 def check_bytes(count: int) -> None:
     """Raise an `UnsupportedError` if the arrays of an instance take too much memory."""
     if count > MAX_ARRAY_BYTES:
-        raise UnsupportedError(
+        raise _TooLargeError(
             f"arrays of {count:,} bytes for each instance, more than {MAX_ARRAY_BYTES:,}"
         )
 
@@ -171,6 +175,9 @@ class ControlFlow:
                     return self._unrolled_scan(scan, MAX_UNROLLED_SCAN_OPERATIONS)
             try:
                 return self._rolled_scan(scan)
+            except _TooLargeError:
+                # Written out, it would be too many operations.
+                raise
             except UnsupportedError as error:
                 # For example, what an index of the step chooses is to be written.
                 obstacle = error

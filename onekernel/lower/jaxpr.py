@@ -23,8 +23,9 @@ infinite or NaN are lowered with `finite=False`. The lowering knows nothing of i
 import dataclasses
 import functools
 import inspect
+import itertools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -56,6 +57,7 @@ from onekernel.lower.linear_algebra import MAX_ROWS, expansion
 from onekernel.lower.random_rules import RANDOM_RULES
 from onekernel.lower.scalar_ir import (
     EVALUATE,
+    Expr,
     ExprGraph,
     Scalar,
     bits_of,
@@ -108,13 +110,16 @@ class ScalarProgram:
     @property
     def size(self) -> int:
         """Return the number of operations; each scalar that is stored in an array is one, too."""
-        stores = sum(len(array.operands) for array in self.block.arrays())
+        stores = sum(len(array.operands) for array in self._arrays())
         return stores + sum(1 for _ in self.block.values())
 
     @property
     def array_bytes(self) -> int:
         """Return the bytes of memory that the arrays of one instance take."""
-        return sum(map(bytes_of, self.block.arrays()))
+        return sum(map(bytes_of, self._arrays()))
+
+    def _arrays(self) -> Iterator[Expr]:
+        return itertools.chain.from_iterable(self.block.arrays())
 
 
 class LateProgram(ScalarProgram):

@@ -379,10 +379,10 @@ class ExprGraph:
         """Convert a scalar to another dtype."""
         if is_constant(x):
             return cast(Constant, convert_constant(np.asarray(x), dtype)[()])
-        if dtype not in DTYPES:
-            raise UnsupportedError(f"a conversion to {dtype}")
         if x.dtype == dtype:
             return x
+        if dtype not in DTYPES:
+            raise UnsupportedError(f"a conversion to {dtype}")
         # A conversion between integers of one size keeps the bits: there and back, nothing changes.
         # So does a number of 32 bits that 64 bits hold without rounding.
         if x.op == "convert" and x.operands[0].dtype == dtype:
@@ -391,6 +391,9 @@ class ExprGraph:
                 return x.operands[0]
         if dtype == _BOOL:
             return self.apply("ne", x, x.dtype.type(0))
+        # A truth value that a loop has stacked is 0 or 1 in memory: there and back, it is the same.
+        if x.op == "ne" and dtype == _INT and _is_stacked_truth(x.operands[0]):
+            return x.operands[0]
         return self._record("convert", (x,), dtype)
 
     def halves(self, x: Scalar) -> tuple[Scalar, Scalar]:
@@ -448,6 +451,12 @@ class ExprGraph:
             # `jnp.arange` has its index everywhere.
             if array.dtype.kind == "i" and all(map(equals, array.operands, itertools.count())):
                 return self.convert(index, array.dtype)
+        elif is_constant(index):
+            # Of such loads there are hundreds of thousands: take the shortest way.
+            key = ("load", array.index, int(index))
+            if key not in self._values:
+                self._values[key] = self._new("load", (array, index), array.dtype)
+            return self._values[key]
         return self._record("load", (array, index), array.dtype)
 
     def begin_loop(
@@ -537,6 +546,20 @@ def bytes_of(array: Expr) -> int:
 def is_table(array: Expr) -> bool:
     """Return whether an array consists of constants, so that all instances can share it."""
     return array.op == "array" and all(map(is_constant, array.operands))
+
+
+def _is_stacked_truth(x: Scalar) -> bool:
+    """Return whether a scalar is loaded from where a loop has stored a truth value."""
+    array = x.operands[0] if isinstance(x, Expr) and x.op == "load" else None
+    if not (isinstance(array, Expr) and isinstance(array.owner, Loop)):
+        return False
+    stored = array.owner.stacked[array.place]
+    return (
+        isinstance(stored, Expr)
+        and stored.op == "convert"
+        and stored.operands[0].dtype == _BOOL
+        and stored.dtype == _INT
+    )
 
 
 def check_scalars(values: Iterable[object]) -> None:

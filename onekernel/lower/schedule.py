@@ -53,15 +53,18 @@ class Block:
                 for block in item.blocks:
                     yield from block.values()
 
-    def arrays(self) -> Iterator[Expr]:
-        """Yield the arrays in memory, here and in the blocks inside, but those of constants."""
+    def arrays(self) -> Iterator[list[Expr]]:
+        """Yield the arrays in memory, here and in the blocks inside, but those of constants.
+
+        Those to which a loop adds are together.
+        """
         for item in self.items:
             if isinstance(item, Expr):
                 if item.op == "array" and not is_table(item):
-                    yield item
+                    yield [item]
             else:
-                if isinstance(item, PlacedLoop):
-                    yield from item.stacks
+                if isinstance(item, PlacedLoop) and item.stacks:
+                    yield item.stacks
                 for block in item.blocks:
                     yield from block.arrays()
 

@@ -22,7 +22,7 @@ from types import ModuleType
 from onekernel import cpu
 from onekernel.codegen import STEP, LlvmWriter, Value, map_function
 from onekernel.codegen import module_text as module_text
-from onekernel.errors import KernelError
+from onekernel.errors import KernelError, UnsupportedError
 from onekernel.kernel import Kernel
 
 LANES = 4
@@ -36,6 +36,9 @@ _FEATURES = "+simd128,+bulk-memory,+nontrapping-fptoint,+sign-ext"
 _LEVEL = 2
 _STACK = 1 << 20
 """Bytes of the stack, below all other memory, so that running over it is an error."""
+
+MAX_ARRAY_BYTES = 64 * 1024
+"""Most memory for the arrays of one instance: those of all lanes are on the stack."""
 
 _LINKERS = ("wasm-ld", *(f"wasm-ld-{version}" for version in range(24, 13, -1)))
 
@@ -65,13 +68,14 @@ def step_text(name: str, kernel: Kernel) -> str:
       The text of an LLVM module.
 
     Raises:
-      UnsupportedError: the program has an operation that has no LLVM instruction.
+      UnsupportedError: the program has an operation that has no LLVM instruction, or arrays that
+        take too much memory.
     """
     w = _begin(name, len(kernel.argument_shapes) + len(kernel.results()), "u32 count")
     *arrays, count = w.parameters
     instances = count.to("u64")
     with w.loop((instances + (LANES - 1)) // LANES) as group:
-        w.call("instances", *arrays, group * LANES, instances)
+        w.call("instances", *arrays, group * LANES, instances, *_memory(w, kernel))
     return module_text([*cpu.step_functions(kernel, LANES), w])
 
 
@@ -89,7 +93,8 @@ def map_text(name: str, kernel: Kernel) -> str:
       The text of an LLVM module.
 
     Raises:
-      UnsupportedError: the program has an operation that has no LLVM instruction.
+      UnsupportedError: the program has an operation that has no LLVM instruction, or arrays that
+        take too much memory.
     """
     assert kernel.table is not None
     items = kernel.table.shape[1]
@@ -99,8 +104,24 @@ def map_text(name: str, kernel: Kernel) -> str:
     w = _begin(name, len(rows), "u32 count")
     *arrays, count = w.parameters
     with w.loop(count.to("u64")) as index:
-        w.call(STEP, *(x.at(index * size, "u8") for x, size in zip(arrays, rows, strict=True)))
+        addresses = [x.at(index * size, "u8") for x, size in zip(arrays, rows, strict=True)]
+        w.call(STEP, *addresses, *_memory(w, kernel))
     return module_text([map_function(kernel.program, lanes=LANES, items=items), w])
+
+
+def _memory(w: LlvmWriter, kernel: Kernel) -> list[Value]:
+    """Return the address of memory for a kernel's arrays, if it has any.
+
+    Raises:
+      UnsupportedError: they take too much.
+    """
+    count = kernel.array_bytes
+    if count > MAX_ARRAY_BYTES:
+        raise UnsupportedError(
+            f"arrays of {count:,} bytes for each instance, more than {MAX_ARRAY_BYTES:,} on a page"
+        )
+    size = cpu.scratch_bytes(kernel, LANES)
+    return [w.allocate(size, "u8", align=64)] if size else []
 
 
 def blocks_text(name: str, functions: Iterable[LlvmWriter], arrays: int, blocks: int) -> str:

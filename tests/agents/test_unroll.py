@@ -7,7 +7,7 @@ import pytest
 from brax.envs import Wrapper
 
 from helpers.further import slow_unless
-from helpers.gliding import Gliding
+from helpers.gliding import Gliding, GlidingPhysics
 from jetbot_mjx.agents.fused import launch
 from jetbot_mjx.agents.fused.arrays import UNROLL
 from jetbot_mjx.agents.fused.shapes import UnrollSpec
@@ -60,12 +60,26 @@ def states_of(ppo, policies):
     return jax.vmap(ppo.packed)(states.replace(env_state=env))
 
 
+class RememberingPhysics(GlidingPhysics):
+    """Its step has an array, which is in memory."""
+
+    def step(self, state, ctrl, mocap_pos=None):
+        rows = jax.lax.scan(lambda c, _: (0.9 * c + ctrl, c), ctrl, length=100)[1]
+        last = jax.lax.scan(lambda c, row: (0.9 * c + row, None), ctrl, rows, reverse=True)[0]
+        return super().step(state, 0.01 * last, mocap_pos)
+
+
+class Remembering(Gliding):
+    physics_class = RememberingPhysics
+
+
 CASES = {
     "jetbot": ("jetbot", 40, 1, (), make_env),
     "egocentric": ("jetbot_egocentric", 17, 3, (), make_env),
     "smoke": ("smoke", 33, 1, (), make_env),
     "drawn robots": ("real_jetbot", 21, 2, (), make_env),
     # These are about the kernel's parts and the networks, not about how a robot moves.
+    "arrays": ("jetbot", 37, 2, (), Remembering),
     "one environment": ("jetbot", 1, 1, (), Gliding),
     "more than a part": ("jetbot", 67, 2, (), Gliding),
     "parts of odd sizes": ("jetbot", 2113, 1, (), Gliding),

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 import onekernel
+from helpers.large_arrays import remembered
 from helpers.small_kernels import launches
 from onekernel import KernelError, UnsupportedError, cpu, fuse, fused, traced
 from onekernel.build import BACKENDS
+from onekernel.lower import control_flow
 
 pytestmark = [
     pytest.mark.skipif(cpu.obstacle() is not None, reason="there are no kernels here"),
@@ -219,6 +221,20 @@ def test_a_batch_without_vmap_is_refused_before_it_is_lowered():
 
     with pytest.raises(UnsupportedError, match="results of 72,024 bytes"):
         fuse(trace, on_unsupported="raise")(jnp.ones(3))
+
+
+def test_of_arrays_that_take_too_much_memory_one_line_is_told_and_xla_computes(monkeypatch):
+    monkeypatch.setattr(control_flow, "MAX_ARRAY_BYTES", 4 * 4 * 2000 - 1)
+
+    def long(x):
+        return remembered(x, 2000)
+
+    x = jnp.float32([0.1, 0.2, 0.3, 0.4])
+    reason = "^XLA computes long, slower: one kernel cannot do arrays of 32,000 bytes .* 31,999"
+    with pytest.warns(UserWarning, match=reason) as told:
+        ours = fuse(long)(x)
+    assert len(told) == 1
+    np.testing.assert_allclose(ours, long(x), rtol=1e-6)
 
 
 @pytest.mark.parametrize("way", ["jit", "vmap", "one instance"])

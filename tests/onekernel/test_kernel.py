@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.large_arrays import remembered
 from helpers.small_kernels import launches, made
-from onekernel import KernelError, cpu, gpu
+from onekernel import KernelError, cpu, fuse, gpu
 
 if all(backend.obstacle() for backend in (cpu, gpu)):
     pytest.skip("there is no kernel here", allow_module_level=True)
@@ -114,6 +115,22 @@ def test_a_programs_platform_decides(step, monkeypatch):
     monkeypatch.setattr(gpu, "obstacle", lambda: None)
     monkeypatch.setattr(gpu, "target_architecture", lambda: 90)
     assert launches(*arguments, platforms=("cuda",)) == 1
+
+
+def test_what_one_platform_cannot_do_of_a_kernel_is_told_there(monkeypatch):
+    monkeypatch.setattr(gpu, "obstacle", lambda: None)
+    monkeypatch.setattr(gpu, "target_architecture", lambda: 90)
+    x = jnp.ones((3, 4))
+    short, long = (jax.vmap(fuse(lambda x, n=n: remembered(x, n))) for n in (4096, 4097))
+    assert launches(short, x, platforms=("cuda",)) == 1
+    reason = "arrays of 65,552 bytes for each instance, more than 65,536 on a GPU"
+    with pytest.warns(UserWarning, match=f"slower: one kernel cannot do {reason}$"):
+        assert launches(long, x, platforms=("cuda",)) == 0
+    one = jax.vmap(fuse(lambda x: remembered(x, 4097), on_unsupported="raise"))
+    with pytest.raises(KernelError, match=f"^one kernel cannot do {reason}$"):
+        launches(one, x, platforms=("cuda",))
+    if not cpu.obstacle():
+        assert launches(long, x, platforms=("cpu",)) == 1
 
 
 def test_a_kernel_that_was_asked_for_is_not_replaced():

@@ -15,6 +15,8 @@ from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import Mesh, PartitionSpec
 
 from helpers import gliding
+from helpers.large_arrays import BYTES, remembered
+from helpers.small_kernels import launches
 from helpers.small_physics import small_physics
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import program_key
@@ -191,6 +193,116 @@ def test_few_instances_have_few_lanes():
     assert [cpu.lanes_for(n) for n in (1, 2, 4, most, 1000)] == [1, 4, 4, most, most]
     text = cpu.kernel_text(kernel_of(lambda x: x + 1, jnp.zeros(()), steps=1), instances=1)
     assert "x float>" not in text
+
+
+@needs_it
+def test_instances_with_large_arrays_have_few_lanes(monkeypatch):
+    host = cpu.host_processor()._replace(lanes=16)
+    monkeypatch.setattr(cpu, "host_processor", lambda: host)
+    mib = 1 << 20
+    sizes = (mib // 2, mib // 2 + 1, mib, mib + 1, 2 * mib, 2 * mib + 1, 9 * mib)
+    assert [cpu.lanes_for(1000, size) for size in sizes] == [16, 8, 8, 4, 4, 1, 1]
+    assert [cpu.lanes_for(3, size) for size in (2 * mib, 2 * mib + 1)] == [4, 1]
+    assert cpu.lanes_for(1, 9 * mib) == 1
+
+
+@pytest.fixture(scope="module")
+def long():
+    return fuse(remembered, on_unsupported="raise")
+
+
+def vectors(*shape):
+    return jnp.asarray(np.random.default_rng(0).normal(size=(*shape, 4)), jnp.float32)
+
+
+def assert_close(one, other):
+    np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+
+
+@needs_it
+def test_arrays_of_many_instances_are_not_on_the_stack(long):
+    x = vectors(256)
+    kernel = long.lowered(x[0]).one
+    assert kernel.array_bytes == BYTES == 704_000
+    # The arrays of all lanes are larger than the stack of a thread.
+    lanes = cpu.lanes_for(256, BYTES)
+    assert cpu.xla_call.scratch_bytes(kernel, lanes) == lanes * BYTES
+    batch = jax.vmap(long)
+    assert launches(long, x[0]) == launches(batch, x) == 1
+    ours = jax.jit(batch)(x)
+    assert_close(ours, jax.jit(jax.vmap(remembered))(x))
+    np.testing.assert_array_equal(jax.jit(long)(x[7]), ours[7])
+
+
+@needs_it
+@pytest.mark.parametrize("instances", [1, 33])
+def test_what_a_step_returns_is_side_by_side_whatever_its_size(instances):
+    def function(x):
+        def forth(c, _):
+            c = 0.9 * c + x[::-1]
+            row = c.astype(jnp.float32), c, c > 0.5, (c * 1e3).astype(int), jnp.int32(c[0] * 9)
+            return c, row
+
+        def back(total, row):
+            narrow, wide, truth, whole, short = row
+            return total * 0.7 + jnp.where(truth, wide, whole) - narrow * short, None
+
+        end, rows = jax.lax.scan(forth, x, length=300)
+        return jax.lax.scan(back, end, rows, reverse=True)[0], rows[1][7]
+
+    with jax.enable_x64(True):
+        x = np.random.default_rng(0).normal(size=(instances, 3))
+        ours = jax.jit(jax.vmap(fuse(function, on_unsupported="raise")))(x)
+        for one, other in zip(ours, jax.jit(jax.vmap(function))(x), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-10)
+
+
+@needs_it
+def test_calls_at_once_have_arrays_of_their_own(long):
+    program, x = jax.jit(jax.vmap(long)), vectors(2, 64)
+    expected = np.stack([program(each) for each in x])
+    found = {}
+
+    def call(which):
+        for count in range(4):
+            found[which, count] = np.asarray(program(x[which]))
+
+    threads = [threading.Thread(target=call, args=[which]) for which in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 8
+    for (which, _), result in found.items():
+        np.testing.assert_array_equal(result, expected[which])
+
+
+@needs_it
+def test_a_scan_takes_a_kernel_with_a_large_array(long):
+    def moved(function):
+        return lambda x: jax.lax.scan(lambda x, _: (x - 0.1 * function(x), x), x, length=3)
+
+    x = vectors(3)
+    ours, theirs = (jax.jit(jax.vmap(moved(f)))(x) for f in (long, remembered))
+    jax.tree.map(assert_close, ours, theirs)
+
+
+@needs_it
+def test_a_gradient_that_stores_much_is_one_kernel():
+    def loss(x):
+        return jnp.square(remembered(x, 11_000)).sum()
+
+    x = vectors(5)
+    one = jax.vmap(fuse(jax.grad(loss), on_unsupported="raise"))
+    assert launches(one, x) == 1
+    assert fuse(jax.grad(loss)).lowered(x[0]).one.array_bytes >= 700_000
+    # The gradient of the kernel itself would pass what is stored from one kernel to another.
+    told = []
+    other = jax.vmap(jax.grad(fuse(loss, on_unsupported=told.append)))
+    theirs = jax.jit(jax.vmap(jax.grad(loss)))(x)
+    assert_close(jax.jit(one)(x), theirs)
+    assert_close(jax.jit(other)(x), theirs)
+    assert {str(x).partition(" of ")[0] for x in told} == {"arguments and results"}
 
 
 @needs_it

@@ -241,6 +241,21 @@ def test_what_a_loop_has_stored_is_an_array_already(graph, x):
         assert graph.array(others).op == "array"
 
 
+def test_a_truth_value_that_a_loop_has_stored_is_a_word_there_and_back(graph, x):
+    loop = graph.begin_loop([], 3)
+    truth = graph.apply("lt", graph.convert(loop.counter, x.dtype), x)
+    whole = graph.convert(x, np.dtype(np.int32))
+    loop.stacked = [graph.convert(truth, np.dtype(np.int32)), graph.apply("add", whole, whole)]
+    graph.end_loop(loop)
+    truths, numbers = ([graph.load(y, np.int32(i)) for i in range(3)] for y in graph.stacks(loop))
+    read = [graph.convert(y, np.dtype(bool)) for y in truths]
+    assert [graph.convert(y, np.dtype(np.int32)) for y in read] == truths
+    assert graph.convert(read[0], np.dtype(np.float32)).op == "convert"
+    # Other whole numbers are not: 2 becomes 1.
+    again = graph.convert(graph.convert(numbers[0], np.dtype(bool)), np.dtype(np.int32))
+    assert again is not numbers[0]
+
+
 def test_an_array_has_words_of_one_dtype(graph, x, flag):
     for scalars in ([x, np.int32(1)], [flag, YES]):
         with pytest.raises(UnsupportedError, match="an array of"):

@@ -224,7 +224,7 @@ def test_an_array_is_made_before_the_loop_that_reads_it(graph, x):
     # What nobody reads is not stored.
     assert (ops(placed.head), ops(placed.body)) == ([], ["load", "add", "neg"])
     assert placed.stacks == [negative]
-    assert set(root.arrays()) == {array, negative}
+    assert list(root.arrays()) == [[array], [negative]]
 
 
 def test_what_a_loop_in_a_loop_stores_is_read_there(graph, x):

@@ -11,7 +11,8 @@ import pytest
 
 from helpers import map_kernels, node
 from helpers.kernel_cases import ARITHMETIC, LOOPS, SCANS, VECTOR, robots
-from onekernel import KernelError, fuse, wasm
+from helpers.large_arrays import remembered
+from onekernel import KernelError, UnsupportedError, fuse, wasm
 from onekernel.codegen import LlvmWriter
 from onekernel.cpu import BLOCK_PARAMETERS, array_of
 from onekernel.kernel import Kernel
@@ -280,6 +281,17 @@ def test_the_blocks_of_an_instance_are_computed_one_after_the_other(module):
     np.testing.assert_array_equal(
         result, [*(numbers * 0.5 + np.arange(HALVES, dtype=np.float32)), 0, 0]
     )
+
+
+def test_arrays_that_the_stack_does_not_hold_are_refused():
+    def kernel(length):
+        program = scalarize(lambda x: remembered(x, length), VECTOR)
+        return Kernel(program, carried=1, steps=1, fallback=list)
+
+    assert "[262144 x i8]" in wasm.step_text("fits", kernel(4096))
+    reason = "^arrays of 65,552 bytes for each instance, more than 65,536 on a page$"
+    with pytest.raises(UnsupportedError, match=reason):
+        wasm.step_text("large", kernel(4097))
 
 
 def test_a_module_needs_nothing_and_is_the_same_every_time(module):

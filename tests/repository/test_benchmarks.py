@@ -605,16 +605,6 @@ def test_a_program_is_the_same_as_one_kernel_and_by_xla(name, capsys, monkeypatc
         programs.main(["nothing"])
 
 
-def test_a_gradient_of_steps_in_groups_is_that_of_all_steps():
-    def sums(x, scan=jax.lax.scan):
-        return scan(lambda c, row: (jnp.sin(c + row), c * row), jnp.float32(0.3), x)
-
-    x = jnp.linspace(-1.0, 1.0, 11)
-    expected = programs.gradient(sums)(x)
-    found = programs.gradient(sums, scan=programs.scan_in_groups)(x)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-
-
 @pytest.mark.parametrize(
     "name", slow_unless("search".__eq__, ["quasiseparable_cholesky", "search", "orbits"])
 )

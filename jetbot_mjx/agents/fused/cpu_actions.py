@@ -110,8 +110,13 @@ class UnrollStage(ActionStage):
           batch: the data, of which the number of environments and the time are used.
           lanes: the number of float32 values in a vector register.
         """
-        super().__init__(unroll.shape, batch, lanes)
         self._unroll, self._time = unroll, batch.time
+        super().__init__(unroll.shape, batch, lanes)
+
+    def scratch_sizes(self) -> dict[str, int]:
+        """Add the arrays of a step."""
+        count = cpu.scratch_bytes(self._unroll.kernel, self.lanes) // 4
+        return super().scratch_sizes() | ({"arrays": count} if count else {})
 
     def own_functions(self) -> list[LlvmWriter]:
         """Write the activation, the sample and the step of the environments."""
@@ -133,7 +138,8 @@ class UnrollStage(ActionStage):
             # Draw the actions, and step the environments.
             self.act(first, count, here, unroll.state)
             with self.groups(count) as start:
-                w.call("instances", before, here["action"], end, first + start, limit)
+                memory = [self.places["arrays"]] if "arrays" in self.places else []
+                w.call("instances", before, here["action"], end, first + start, limit, *memory)
             # Copy what is kept of the states.
             with w.loop(count) as row:
                 environment = first + row
