@@ -28,9 +28,9 @@ Protocol of a training step:
    Adam.
 
 A `Learner` computes actions and update. `XlaLearner` (`xla_learner`, with the loss in `loss`) is
-the readable reference in JAX's functions. `FusedLearner` (`fused.learner`, with the same loss of
-one sample in `fused.sample_loss`) does the same faster by the kernels that docs/kernels.md
-explains; `ppo.update: auto`, the default, chooses it where it can run.
+the readable reference in JAX's functions. `FusedLearner`, with the same loss of one sample, does
+the same faster by the kernels that docs/kernels.md explains; `ppo.update: auto`, the default,
+chooses it where it can run.
 
 Networks, action distribution, running statistics, steps, gradients and the ADAPTIVE_KL rule
 are Brax's. On one device and with `normalizer: brax` and `update: xla`, the order of the random
