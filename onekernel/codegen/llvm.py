@@ -110,7 +110,9 @@ def tile_function(
     def load(row: int) -> Value:
         return tile.at(row, w.vector).load(w.vector, align=4 * lanes)
 
-    program = ordered(program)
+    # The steps of a scan of a single instance wait for each other more than for what was spilled:
+    # in the order of the function, they are up to a fifth faster.
+    program = ordered(program, scans=lanes > 1)
     # An argument that goes to an array is loaded when it is stored there: of thousands of them, few
     # wait in registers. One that is a result, too, must be loaded before results replace it.
     body = ProgramWriter(w, program, memory=memory[0] if memory else None)

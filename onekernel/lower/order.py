@@ -33,27 +33,30 @@ _REGISTERS = 32
 """Numbers that are in registers while spills are counted."""
 
 
-def ordered(program: ScalarProgram) -> ScalarProgram:
+def ordered(program: ScalarProgram, *, scans: bool = True) -> ScalarProgram:
     """Return a program whose operations are in an order in which few numbers wait for their use.
 
     Args:
       program: the program, which is not changed.
+      scans: whether to order what is in counted loops, too.
     """
     results = [x for array in program.outputs for x in array.ravel()]
-    return dataclasses.replace(program, block=_ordered_block(program.block, results))
+    return dataclasses.replace(program, block=_ordered_block(program.block, results, scans))
 
 
-def _ordered_block(block: Block, results: Iterable[Scalar]) -> Block:
+def _ordered_block(block: Block, results: Iterable[Scalar], scans: bool) -> Block:
     """Order a block and those inside it; `results` are used after its last item."""
     order = _Order(block.items, set(_indices(results)))
     items = min(block.items, order.find(), key=order.count_spills)
-    return dataclasses.replace(block, items=[*map(_ordered_item, items)])
+    return dataclasses.replace(block, items=[_ordered_item(item, scans) for item in items])
 
 
-def _ordered_item(item: Item) -> Item:
+def _ordered_item(item: Item, scans: bool) -> Item:
     if isinstance(item, Expr):
         return item
-    one, other = (_ordered_block(block, after) for block, after in _inside(item))
+    if isinstance(item, PlacedLoop) and item.loop.counter is not None and not scans:
+        return item
+    one, other = (_ordered_block(block, after, scans) for block, after in _inside(item))
     if isinstance(item, PlacedBranch):
         return dataclasses.replace(item, if_false=one, if_true=other)
     return dataclasses.replace(item, head=one, body=other)

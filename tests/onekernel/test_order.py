@@ -108,6 +108,25 @@ def test_loops_and_branches_have_the_same_operations_each_behind_its_operands():
     assert indices(program.outputs[0].ravel()) <= there
 
 
+def test_the_steps_of_a_scan_keep_their_order_where_that_is_asked_for():
+    def scanned(x):
+        def step(c, _):
+            c = jnp.stack([rows(c), rows(c[::-1])]) * 0.5
+            return c, c
+
+        return rows(jax.lax.scan(step, x, length=100)[1].sum(0))
+
+    def bodies(program):
+        return [[x.index for x in y.body.values()] for y in blocks_in(program.block, PlacedLoop)]
+
+    program = scalarize(scanned, PAIR)
+    found, kept = ordered(program), ordered(program, scans=False)
+    assert len(bodies(program)) == 1
+    assert bodies(kept) == bodies(program) != bodies(found)
+    outside = [[x.index for x in p.block.items if isinstance(x, Expr)] for p in (program, kept)]
+    assert outside[0] != outside[1]
+
+
 def test_what_takes_the_result_of_a_loop_waits_for_the_loop():
     def after_loop(x):
         total = x[0] + x[1]
