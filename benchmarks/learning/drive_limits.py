@@ -21,9 +21,9 @@ MARGIN = 1.005
 
 _MARGIN_OF_SPEED = 1.003  # the same for speeds, which the motors' controller holds closely
 
-_MARGIN_OF_SPUN = 1.2  # the same for what is rare: backwards, or after a robot has spun
+_MARGIN_OF_SPUN = 1.3  # the same for what is rare: backwards, or after a robot has spun
 
-_MARGIN_OF_ERROR = 2.5  # a search for commands finds some that are twice as far apart
+_MARGIN_OF_ERROR = 2.5  # a search for commands finds some that are farther apart
 
 # Chosen; `Limits.error` is measured with them.
 GROWTH = 0.45  # [rad/s²] by which |ω| may grow faster than by the drift
@@ -207,12 +207,15 @@ class Gains(NamedTuple):
     """[rad/m] of the place across, by the heading."""
     along: float
     """[1/s] of the place along."""
+    early: bool
+    """Whether it begins early what is too fast for it."""
 
 
 _GAINS = [
-    Gains(heading, across, along)
-    for heading in (0.0, 3.0, 6.0, 10.0, 16.0, 25.0)
-    for across, along in ((0.0, 0.0), (3.0, 2.0), (6.0, 5.0))
+    Gains(heading, across, along, early)
+    for heading in (0.0, 6.0, 16.0, 40.0)
+    for across, along in ((3.0, 2.0), (6.0, 5.0), (3.0, 8.0), (10.0, 8.0))
+    for early in (False, True)
 ]
 
 
@@ -220,6 +223,8 @@ def follow(moved: Motion, limits: Limits, gains: Gains) -> Motion:
     """Return drives that keep to limits of torque and motors, and follow others closely."""
     late, both = limits.lateness, np.zeros((2, *moved.speed.shape))
     headings = np.unwrap(moved.heading, axis=1) - moved.heading[:, :1]
+    wanted = np.stack([moved.speed, moved.yaw_rate])
+    wanted = _early(moved, limits) if gains.early else wanted
     speed, yaw_rate = moved.speed[:, 0], moved.yaw_rate[:, 0]
     place, heading = np.zeros((len(speed), 2)), np.zeros_like(speed)
 
@@ -232,19 +237,19 @@ def follow(moved: Motion, limits: Limits, gains: Gains) -> Motion:
 
     for t in range(1, moved.speed.shape[1]):
         now = headings[:, t]
-        aim_speed, aim_rate = moved.speed[:, t], moved.yaw_rate[:, t]
+        aim_speed, aim_rate = wanted[:, :, t]
         # How far would it be off with the same rates?
         after, turned = move(aim_speed, aim_rate)
         apart = moved.position[:, t, :2] - after
         off = _on_floor(apart[:, 0], apart[:, 1], -now)
         bend = np.clip(gains.across * off[:, 1] * np.sign(aim_speed), -_BEND, _BEND)
         rate = aim_rate + gains.heading * (now - turned + bend)
-        fastest = np.maximum(np.abs(aim_rate), limits.motor_yaw_rate)
+        room = (limits.max_wheel_speed - aim_speed) / limits.half_track
+        fastest = np.maximum(np.abs(aim_rate), np.minimum(limits.motor_yaw_rate, room))
         rate = np.clip(rate, -fastest, fastest)
         # The speed is none that the robot could not have.
-        wheel = limits.half_track * np.abs(aim_rate) + aim_speed
-        room = np.maximum(wheel, limits.max_wheel_speed) - limits.half_track * np.abs(rate)
-        most = np.maximum(aim_speed, np.minimum(limits.max_speed, room))
+        room = limits.max_wheel_speed - limits.half_track * np.abs(rate)
+        most = np.minimum(limits.max_speed, room)
         ahead = np.clip(aim_speed + gains.along * off[:, 0], np.minimum(aim_speed, 0), most)
         ends = _torque(speed, yaw_rate, ahead, rate, limits)
         place, heading = move(*ends)
@@ -259,12 +264,40 @@ def _velocity(
     return _on_floor(speed, -limits.slip * speed * yaw_rate, heading)
 
 
+def _early(moved: Motion, limits: Limits) -> Float[np.ndarray, "2 n t"]:
+    """Return speeds and yaw rates of a drive that begins early what is too fast for the limits."""
+    v, w = moved.speed, moved.yaw_rate
+    drifted = _drifted(v[:, :-1], w[:, :-1], limits)
+    sides = np.stack([v + limits.track * w, v - limits.track * w])
+    grown, before = sides[:, :, 1:] - drifted, np.zeros_like(sides)
+    # Backwards in time: by how much must a side be faster than in the other drive, so that all
+    # that follows can be reached?
+    for t in range(v.shape[1] - 2, 0, -1):
+        needed = grown[:, :, t] + before[:, :, t + 1]
+        low, high = needed - limits.step, needed + limits.brake * limits.step
+        before[:, :, t] = np.clip(0, low, high)
+    p, q = sides + before
+    return np.stack([(p + q) / 2, (p - q) / 2 / limits.track])
+
+
 def _torque(
     v: np.ndarray, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray, limits: Limits
 ) -> np.ndarray:
     """Return speeds and yaw rates after a control step towards others, within the limits."""
-    dt, track, most = limits.ctrl_dt, limits.track, limits.step
-    # The drift.
+    track, most = limits.track, limits.step
+    p, q = _drifted(v, w, limits)
+    # The torque that comes closest; it does not raise |ω| beyond the motors' yaw rate.
+    a = np.clip(ahead + track * rate - p, -limits.brake * most, most)
+    b = np.clip(ahead - track * rate - q, -limits.brake * most, most)
+    room = np.maximum(2 * track * limits.motor_yaw_rate - np.abs(p - q), 0)
+    beyond = np.sign(p - q) * np.maximum(np.sign(p - q) * (a - b) - room, 0) / 2
+    p, q = p + a - beyond, q + b + beyond
+    return np.stack([(p + q) / 2, (p - q) / 2 / track])
+
+
+def _drifted(v: np.ndarray, w: np.ndarray, limits: Limits) -> np.ndarray:
+    """Return p and q after a control step without torque."""
+    dt, track = limits.ctrl_dt, limits.track
     sign, lost = np.sign(w), np.maximum(v, 0) * w**2
     swing = limits.swing * v * w * track
     outer, inner = limits.outer_loss * lost, limits.inner_loss * lost
@@ -274,13 +307,7 @@ def _torque(
     p = p + dt * (swing - slowed - np.where(sign > 0, outer, inner) + grows * (sign > 0))
     q = v - track * w
     q = q + dt * (-swing - slowed - np.where(sign < 0, outer, inner) + grows * (sign < 0))
-    # The torque that comes closest; it does not raise |ω| beyond the motors' yaw rate.
-    a = np.clip(ahead + track * rate - p, -limits.brake * most, most)
-    b = np.clip(ahead - track * rate - q, -limits.brake * most, most)
-    room = np.maximum(2 * track * limits.motor_yaw_rate - np.abs(p - q), 0)
-    beyond = np.sign(p - q) * np.maximum(np.sign(p - q) * (a - b) - room, 0) / 2
-    p, q = p + a - beyond, q + b + beyond
-    return np.stack([(p + q) / 2, (p - q) / 2 / track])
+    return np.stack([p, q])
 
 
 def path(moved: Motion, limits: Limits) -> Float[np.ndarray, "n t 2"]:
@@ -390,7 +417,7 @@ def _with_the_rest(whole: Motion, limits: Limits) -> Limits:
     return limits._replace(
         max_speed=fastest,
         min_speed=slowest,
-        max_wheel_speed=_MARGIN_OF_SPEED * float(wheel[calm].max()),
+        max_wheel_speed=MARGIN * float(wheel[calm].max()),
         grip=_MARGIN_OF_SPUN * float(grip.max()),
         spun_step=_MARGIN_OF_SPUN * float(growth.max()),
         error=_MARGIN_OF_ERROR * float(errors(whole, near, limits).max()),

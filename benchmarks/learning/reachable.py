@@ -104,7 +104,8 @@ class _Lattice:
         grown = free * dt * (limits.swing * limits.max_speed + limits.growth)
         self.spins = limits.max_yaw_rate > limits.motor_yaw_rate
         most = free + int(np.ceil(grown)) if self.spins else ranks
-        most += 3  # where the drift may lead
+        # Where the drift may lead, and between the torque of one side and of the other.
+        most += 3 + max(self.up, self.down)
         low = int(np.ceil(-2 * limits.min_speed / width)) + 1
         self.first = -((low + most) // 2 + 3)
         q = np.arange(self.first, (levels + 1 + most) // 2 + 4)[:, None]
@@ -126,7 +127,8 @@ class _Lattice:
         swing, drag = limits.swing * self.v * s, limits.drag * self.w**2
         lost = np.maximum(self.v, 0) * self.w**2
         outer, inner = drag + limits.outer_loss * lost, drag + limits.inner_loss * lost
-        grows = 2 * self.track * limits.growth * (size > limits.motor_yaw_rate + 1e-9)
+        # Already at the motors' yaw rate itself, so that all states above it have it whole.
+        grows = 2 * self.track * limits.growth * (size > limits.motor_yaw_rate - 1e-9)
         self.drift_p = (swing - np.where(sign > 0, outer, inner) + grows * (sign > 0)) * dt / width
         self.drift_q = (-swing - np.where(sign < 0, outer, inner) + grows * (sign < 0)) * dt / width
 

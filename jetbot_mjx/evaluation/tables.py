@@ -165,9 +165,10 @@ def best_known_lines(report: Report) -> str:
         for one in best.by_direction
         if one.gap is not None
     )
+    goals = "one goal" if best.total.reached == 1 else f"mean of {best.total.reached:,} goals"
     return (
         f"{abs(best.total.gap):.2%} {'slower' if best.total.gap >= 0 else 'faster'} than best known"
-        f" (mean of {best.total.reached:,} goals: {best.total.policy_mean:.3f} s, best known"
+        f" ({goals}: {best.total.policy_mean:.3f} s, best known"
         f" {best.total.best_mean:.3f} s)\n  by the goal's bearing: {directions}\n"
     )
 

@@ -155,7 +155,9 @@ def _lines(stream: TextIO) -> _Display:
     @contextlib.contextmanager
     def show(name: str, total: int | None) -> Iterator[Advance]:
         done, began = 0, time.monotonic()
-        first: tuple[int, float] | None = None  # what was done at the first report, and when
+        # What was done at the first report, and at the last one, and when.
+        first: tuple[int, float] | None = None
+        last: tuple[int, float] = 0, began
         last_line = began
         finished = threading.Event()
 
@@ -169,9 +171,10 @@ def _lines(stream: TextIO) -> _Display:
                     say_how_far()
 
         def advance(count: int) -> None:
-            nonlocal done, first
+            nonlocal done, first, last
             done += count
-            first = first or (done, time.monotonic())
+            last = done, time.monotonic()
+            first = first or last
             if total and done < total:
                 say_how_far()
 
@@ -183,7 +186,7 @@ def _lines(stream: TextIO) -> _Display:
             last_line = now
             counted = "" if total is None else f" {done:,} of {total:,},"
             if total and first and done > first[0]:
-                say(f"{name}:{counted} about {_seconds_left(first, now, done, total):.0f} s left")
+                say(f"{name}:{counted} about {_seconds_left(first, last, now, total):.0f} s left")
             else:
                 say(f"{name}:{counted} {now - began:.0f} s so far")
 
@@ -198,15 +201,20 @@ def _lines(stream: TextIO) -> _Display:
     return show
 
 
-def _seconds_left(first: tuple[int, float], now: float, done: int, total: int) -> float:
-    """Return how long a stage will still take, at the speed since its first report.
+def _seconds_left(
+    first: tuple[int, float], last: tuple[int, float], now: float, total: int
+) -> float:
+    """Return how long a stage will still take, at the speed between its first and last report.
 
-    What came before that has compiled, too, and says nothing about the rest.
+    What came before the first has compiled, too, and says nothing about the rest.
 
     Args:
       first: how many units the first report told, and when [s].
+      last: the same of the last report, which told more.
       now: the time [s].
-      done: units that are done, more than the first report told.
       total: all units.
     """
-    return (now - first[1]) * (total - done) / (done - first[0])
+    each = (last[1] - first[1]) / (last[0] - first[0])
+    # The next unit is on its way, and takes at least as long as it has taken.
+    under_way = now - last[1]
+    return max(each - under_way, 0) + each * (total - last[0] - 1)

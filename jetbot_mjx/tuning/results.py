@@ -108,6 +108,12 @@ def run_search(
     )
     search.run(trials, round_size)
     say(f"search finished after {process_seconds():.1f} s")
+    path = write_results(folder, config, search, [])
+    if confirm:
+        say(
+            f"{path} is the best trial so far; what follows trains the best trials anew, and begins"
+            " anew if stopped (--confirm 0 leaves it out)"
+        )
     entrants = search.confirm(confirm, CONFIRM_SEEDS, round_size)
     path = write_results(folder, config, search, entrants)
     values = best_values(search, entrants)

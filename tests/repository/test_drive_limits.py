@@ -132,7 +132,9 @@ def _wild():
     return _rolling(speed, yaw_rate, limits), limits
 
 
-@pytest.mark.parametrize("gains", [Gains(0.0, 0.0, 0.0), Gains(10.0, 3.0, 2.0)])
+@pytest.mark.parametrize(
+    "gains", [Gains(0.0, 0.0, 0.0, early=False), Gains(10.0, 3.0, 2.0, early=True)]
+)
 def test_a_drive_within_the_limits_follows_any_other(gains):
     wild, limits = _wild()
     near = follow(wild, limits, gains)
@@ -166,7 +168,7 @@ def test_a_following_drive_returns_to_where_the_other_is():
         np.linalg.norm(
             path(follow(moved, limits, gains), limits)[0, -1] - moved.position[0, -1, :2]
         )
-        for gains in (Gains(0.0, 0.0, 0.0), Gains(10.0, 6.0, 5.0))
+        for gains in (Gains(0.0, 0.0, 0.0, early=False), Gains(16.0, 6.0, 5.0, early=True))
     ]
     assert apart[0] > 0.02
     assert apart[1] < 0.002
@@ -175,7 +177,11 @@ def test_a_following_drive_returns_to_where_the_other_is():
 def test_the_nearest_drive_is_the_closest_of_those_that_follow():
     wild, limits = _wild()
     least = errors(wild, nearest(wild, limits), limits).max(axis=1)
-    for gains in (Gains(0.0, 0.0, 0.0), Gains(25.0, 0.0, 0.0), Gains(10.0, 6.0, 5.0)):
+    for gains in (
+        Gains(0.0, 0.0, 0.0, early=False),
+        Gains(40.0, 3.0, 2.0, early=False),
+        Gains(16.0, 6.0, 5.0, early=True),
+    ):
         one = errors(wild, follow(wild, limits, gains), limits).max(axis=1)
         assert (least <= one + 1e-12).all()
         assert (least < one).any()

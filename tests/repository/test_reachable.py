@@ -46,7 +46,7 @@ def motions(limits: Limits, seed: int, count: int) -> tuple[np.ndarray, np.ndarr
     v, w, all_v, all_w = np.zeros(count), np.zeros(count), [], []
     begins, ends = rng.integers(0, STEPS, (2, count))
     side, slow = rng.choice([-1.0, 1.0], count), rng.uniform(0, 1, count)
-    wanders = rng.uniform(size=count) < 0.5
+    wanders, lets = rng.uniform(size=(2, count)) < 0.5
     turn, fast = side * limits.motor_yaw_rate, np.zeros(count)
     for t in range(STEPS + 1):
         all_v.append(v)
@@ -56,10 +56,14 @@ def motions(limits: Limits, seed: int, count: int) -> tuple[np.ndarray, np.ndarr
         turn = np.where(~wanders & (t >= ends), 0, turn)
         fast = np.where(wanders | (t >= begins), 1, slow * (slow > 0.7)) * limits.max_speed
         both, apart = limits.outer_loss + limits.inner_loss, limits.outer_loss - limits.inner_loss
-        drift_w = (limits.swing * v * w - np.sign(w) * apart / 2 / g * v * w**2) * dt
+        grown = limits.growth * np.sign(w) * (np.abs(w) > limits.motor_yaw_rate)
+        drift_w = (limits.swing * v * w - np.sign(w) * apart / 2 / g * v * w**2 + grown) * dt
         drift_v = -(limits.drag + both / 2 * v) * w**2 * dt
         most = limits.step / g
-        nw = w + drift_w + np.clip(turn - w - drift_w, -most, most)
+        torque = np.clip(turn - w - drift_w, -most, most)
+        # Above the motors' yaw rate, some let the turn grow by itself.
+        grows = lets & (np.abs(turn) == limits.motor_yaw_rate) & (torque * w < 0)
+        nw = w + drift_w + np.where(grows & (np.abs(w) < 0.8 * limits.max_yaw_rate), 0, torque)
         left = limits.step - g * np.abs(nw - w - drift_w)
         fast = np.minimum(fast, limits.max_wheel_speed - limits.half_track * np.abs(nw))
         nv = v + drift_v + np.clip(fast - v - drift_v, -left, left)
@@ -68,8 +72,22 @@ def motions(limits: Limits, seed: int, count: int) -> tuple[np.ndarray, np.ndarr
     return np.stack(all_v), np.stack(all_w)
 
 
-@pytest.mark.parametrize("limits", [PLAIN, SPINNING], ids=["plain", "spinning"])
-@pytest.mark.parametrize("grid", [Grid(1, 48), Grid(2, 36)], ids=["coarse", "finer"])
+# It turns faster and faster by itself.
+GROWING = PLAIN._replace(growth=4.0, max_yaw_rate=12.0, swing=0.2)
+
+
+@pytest.mark.parametrize(
+    ("limits", "grid"),
+    [
+        (PLAIN, Grid(1, 48)),
+        (PLAIN, Grid(2, 36)),
+        (PLAIN, Grid(7, 36)),
+        (SPINNING, Grid(1, 48)),
+        (SPINNING, Grid(2, 36)),
+        (GROWING, Grid(2, 36)),
+    ],
+    ids=["plain-1", "plain-2", "plain-7", "spinning-1", "spinning-2", "growing-2"],
+)
 def test_no_motion_within_the_limits_gets_farther(limits, grid):
     table = farthest(limits, STEPS, grid)
     angles = np.arange(grid.headings) * 2 * np.pi / grid.headings

@@ -68,6 +68,12 @@ def test_the_first_item_which_compiles_says_nothing_about_the_time_left(monkeypa
     assert said == ["policies: 1 of 3, 60 s so far", "policies: 2 of 3, about 12 s left"]
 
 
+@pytest.mark.parametrize(("now", "left"), [(30.0, 40.0), (35.0, 35.0), (50.0, 30.0)])
+def test_the_time_left_falls_while_an_item_is_under_way(now, left):
+    # The second to fourth of eight took ten seconds each.
+    assert progress._seconds_left((1, 0.0), (4, 30.0), now, 8) == left
+
+
 def test_a_stage_that_advances_slowly_tells_how_long_it_will_take(monkeypatch):
     monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 0.0)
     monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.2)

@@ -8,7 +8,7 @@ import pytest
 from helpers import point_mass
 from jetbot_mjx.config import load_config
 from jetbot_mjx.tuning.results import entrants_table, run_search
-from jetbot_mjx.tuning.search import Entrant
+from jetbot_mjx.tuning.search import Entrant, Search
 from jetbot_mjx.tuning.space import read_space
 from jetbot_mjx.tuning.trials import Trials
 
@@ -49,6 +49,21 @@ def test_a_search_in_an_environment_maximises_the_return(tmp_path):
     assert "| trial | mean return | last return | mean time [s] | ppo.learning_rate |" in tables
     assert (folder / "trials.csv").read_text().startswith("trial,state,score,episode_return,")
     assert load_config(folder / "best.yaml").environment == config.environment
+
+
+@pytest.mark.slow
+def test_a_search_that_is_stopped_in_its_final_trainings_has_results(tmp_path, monkeypatch):
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Search, "confirm", stop)
+    config, said = point_mass.config(), []
+    space = read_space({"ppo.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True}}, config)
+    with pytest.raises(KeyboardInterrupt):
+        run_search(config, space, tmp_path, trials=2, round_size=2, confirm=1, say=said.append)
+    assert load_config(tmp_path / "best.yaml").environment == config.environment
+    assert (tmp_path / "trials.md").read_text().startswith("| trial |")
+    assert said[-1].startswith(f"{tmp_path / 'best.yaml'} is the best trial so far; what follows")
 
 
 @pytest.mark.slow
