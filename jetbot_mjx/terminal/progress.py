@@ -155,9 +155,7 @@ def _lines(stream: TextIO) -> _Display:
     @contextlib.contextmanager
     def show(name: str, total: int | None) -> Iterator[Advance]:
         done, began = 0, time.monotonic()
-        # What was done at the first report, and at the last one, and when.
-        first: tuple[int, float] | None = None
-        last: tuple[int, float] = 0, began
+        reports: list[tuple[int, float]] = []  # the first and the last: what was done, and when
         last_line = began
         finished = threading.Event()
 
@@ -171,10 +169,10 @@ def _lines(stream: TextIO) -> _Display:
                     say_how_far()
 
         def advance(count: int) -> None:
-            nonlocal done, first, last
+            nonlocal done
             done += count
-            last = done, time.monotonic()
-            first = first or last
+            reports.append((done, time.monotonic()))
+            del reports[1:-1]
             if total and done < total:
                 say_how_far()
 
@@ -185,8 +183,9 @@ def _lines(stream: TextIO) -> _Display:
                 return
             last_line = now
             counted = "" if total is None else f" {done:,} of {total:,},"
-            if total and first and done > first[0]:
-                say(f"{name}:{counted} about {_seconds_left(first, last, now, total):.0f} s left")
+            if total and reports and done > reports[0][0]:
+                left = _seconds_left(reports[0], reports[-1], now, total)
+                say(f"{name}:{counted} about {left:.0f} s left")
             else:
                 say(f"{name}:{counted} {now - began:.0f} s so far")
 
