@@ -11,7 +11,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import IO, TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:
@@ -184,8 +184,7 @@ def _lines(stream: TextIO) -> _Display:
             last_line = now
             counted = "" if total is None else f" {done:,} of {total:,},"
             if total and reports and done > reports[0][0]:
-                left = _seconds_left(reports[0], reports[-1], now, total)
-                say(f"{name}:{counted} about {left:.0f} s left")
+                say(f"{name}:{counted} about {_seconds_left(reports, now, total):.0f} s left")
             else:
                 say(f"{name}:{counted} {now - began:.0f} s so far")
 
@@ -200,19 +199,17 @@ def _lines(stream: TextIO) -> _Display:
     return show
 
 
-def _seconds_left(
-    first: tuple[int, float], last: tuple[int, float], now: float, total: int
-) -> float:
+def _seconds_left(reports: Sequence[tuple[int, float]], now: float, total: int) -> float:
     """Return how long a stage will still take, at the speed between its first and last report.
 
     What came before the first has compiled, too, and says nothing about the rest.
 
     Args:
-      first: how many units the first report told, and when [s].
-      last: the same of the last report, which told more.
+      reports: how many units the first and the last report told, and when [s].
       now: the time [s].
       total: all units.
     """
+    first, last = reports[0], reports[-1]
     each = (last[1] - first[1]) / (last[0] - first[0])
     # The next unit is on its way, and takes at least as long as it has taken.
     under_way = now - last[1]

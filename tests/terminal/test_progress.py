@@ -71,7 +71,7 @@ def test_the_first_item_which_compiles_says_nothing_about_the_time_left(monkeypa
 @pytest.mark.parametrize(("now", "left"), [(30.0, 40.0), (35.0, 35.0), (50.0, 30.0)])
 def test_the_time_left_falls_while_an_item_is_under_way(now, left):
     # The second to fourth of eight took ten seconds each.
-    assert progress._seconds_left((1, 0.0), (4, 30.0), now, 8) == left
+    assert progress._seconds_left([(1, 0.0), (4, 30.0)], now, 8) == left
 
 
 def test_a_stage_that_advances_slowly_tells_how_long_it_will_take(monkeypatch):
